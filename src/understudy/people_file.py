@@ -1,0 +1,172 @@
+"""people.json: what `understudy estimate` writes (docs/people.md). Reading, writing; nothing else knows the format."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from understudy.errors import RecordingError
+from understudy.files import read_json, write_atomically
+from understudy.skeleton import N_JOINTS
+from understudy.types import INFERRED, MISSING, OBSERVED, Keypoints2D, Palm, Person
+
+FORMAT = "people/1"
+
+
+@dataclass(frozen=True)
+class FramePeople:
+    """The people of one frame."""
+
+    index: int
+    people: tuple[Person, ...]
+    timestamp_s: float | None = None
+    skipped: str | None = None
+    """why the frame could not be read; None when it could"""
+
+
+@dataclass(frozen=True)
+class PeopleFile:
+    """A people.json."""
+
+    method: str
+    recording: str
+    frames: tuple[FramePeople, ...] = field(default=())
+
+    def write(self, path: Path) -> None:
+        """Writes the file, whole or not at all."""
+        data = {
+            "format": FORMAT,
+            "method": self.method,
+            "recording": self.recording,
+            "frames": [frame_to_json(f) for f in self.frames],
+        }
+        write_atomically(path, json.dumps(data, allow_nan=False))
+
+    @classmethod
+    def read(cls, path: Path) -> PeopleFile:
+        """Reads the file. Raises RecordingError that names the file and the field."""
+        data = read_json(path)
+        if data.get("format") != FORMAT:
+            raise RecordingError(f"{path}: field 'format' must be {FORMAT!r}, got {data.get('format')!r}")
+        if not isinstance(data.get("frames"), list):
+            raise RecordingError(f"{path}: field 'frames' must be a list")
+        frames = tuple(frame_from_json(f, f"{path}: frames[{i}]") for i, f in enumerate(data["frames"]))
+        return cls(str(data.get("method", "")), str(data.get("recording", "")), frames)
+
+
+def frame_to_json(frame: FramePeople) -> dict[str, Any]:
+    """One entry of 'frames'."""
+    out: dict[str, Any] = {"index": frame.index}
+    if frame.timestamp_s is not None:
+        out["timestamp_s"] = frame.timestamp_s
+    out["people"] = [_person_to_json(p) for p in frame.people]
+    if frame.skipped is not None:
+        out["skipped"] = frame.skipped
+    return out
+
+
+def frame_from_json(data: Any, where: str) -> FramePeople:
+    """The inverse of `frame_to_json`; `where` names the place in errors."""
+    if not isinstance(data, Mapping) or not isinstance(data.get("index"), int):
+        raise RecordingError(f"{where}: must be an object with a whole number 'index'")
+    people = data.get("people")
+    if not isinstance(people, list):
+        raise RecordingError(f"{where}: field 'people' must be a list")
+    return FramePeople(
+        data["index"],
+        tuple(_person_from_json(p, f"{where}.people[{i}]") for i, p in enumerate(people)),
+        data.get("timestamp_s"),
+        data.get("skipped"),
+    )
+
+
+def _person_to_json(person: Person) -> dict[str, Any]:
+    out: dict[str, Any] = {"id": person.id}
+    if person.failed is not None:
+        out["failed"] = person.failed
+    else:
+        out["keypoints"] = rows_to_json(person.keypoints, 4)
+        out["confidence"] = [round(float(c), 4) for c in person.confidence]
+        out["sigma_m"] = [None if math.isnan(s) else round(float(s), 4) for s in person.sigma_m]
+        out["source"] = list(person.source)
+    out["keypoints_2d"] = [[round(float(x), 3) for x in row] for row in person.keypoints_2d.rows()]
+    out["hands"] = {
+        side: None
+        if palm is None
+        else {
+            "normal": [round(float(x), 5) for x in palm.normal],
+            "confidence": round(float(palm.confidence), 4),
+        }
+        for side, palm in person.hands.items()
+    }
+    return out
+
+
+def _person_from_json(data: Any, where: str) -> Person:
+    if not isinstance(data, Mapping):
+        raise RecordingError(f"{where}: must be an object")
+    keypoints_2d = Keypoints2D.from_rows(rows_from_json(data.get("keypoints_2d"), 3, f"{where}.keypoints_2d"))
+    id = data.get("id", 0)
+    if "failed" in data:
+        return Person.failure(keypoints_2d, str(data["failed"])).with_id(id)
+    source = data.get("source")
+    if (
+        not isinstance(source, list)
+        or len(source) != N_JOINTS
+        or not set(source) <= {OBSERVED, INFERRED, MISSING}
+    ):
+        raise RecordingError(f"{where}.source: must be 18 of {OBSERVED}, {INFERRED}, {MISSING}")
+    hands = {
+        side: _palm_from_json((data.get("hands") or {}).get(side), f"{where}.hands.{side}")
+        for side in ("left", "right")
+    }
+    return Person(
+        keypoints_2d,
+        rows_from_json(data.get("keypoints"), 3, f"{where}.keypoints"),
+        _numbers(data.get("confidence"), f"{where}.confidence"),
+        _numbers(data.get("sigma_m"), f"{where}.sigma_m"),
+        tuple(source),
+        id,
+        hands,
+    )
+
+
+def _palm_from_json(data: Any, where: str) -> Palm | None:
+    if data is None:
+        return None
+    try:
+        return Palm(np.array(data["normal"], dtype=np.float64).reshape(3), float(data.get("confidence", 1.0)))
+    except (TypeError, KeyError, ValueError) as e:
+        raise RecordingError(f"{where}: needs a 'normal' of 3 numbers ({e})") from e
+
+
+def rows_to_json(rows: np.ndarray, digits: int) -> list[list[float] | None]:
+    """18 x n array -> lists; a row with a NaN becomes null."""
+    return [None if np.isnan(r).any() else [round(float(x), digits) for x in r] for r in rows]
+
+
+def rows_from_json(data: Any, n: int, where: str) -> np.ndarray:
+    """18 rows of n numbers (or null -> NaN). Raises RecordingError that names `where`."""
+    if not isinstance(data, Sequence) or len(data) != N_JOINTS:
+        raise RecordingError(f"{where}: must be a list of {N_JOINTS} rows")
+    try:
+        return np.array(
+            [[np.nan] * n if r is None else [float(x) for x in r] for r in data], dtype=np.float64
+        ).reshape(18, n)
+    except (TypeError, ValueError) as e:
+        raise RecordingError(f"{where}: each row must be {n} numbers or null ({e})") from e
+
+
+def _numbers(data: Any, where: str) -> np.ndarray:
+    if not isinstance(data, Sequence) or len(data) != N_JOINTS:
+        raise RecordingError(f"{where}: must be a list of {N_JOINTS} numbers")
+    try:
+        return np.array([np.nan if x is None else float(x) for x in data])
+    except (TypeError, ValueError) as e:
+        raise RecordingError(f"{where}: must be numbers ({e})") from e

@@ -1,0 +1,167 @@
+"""The data that flows through the system, in the order in which it flows. Frozen; frames, units: CONVENTIONS.md."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from jaxtyping import Float, Float32, UInt8
+
+from understudy.camera import Camera, RGBDCamera, check_registered
+from understudy.errors import FrameError
+from understudy.skeleton import N_JOINTS
+
+OBSERVED, INFERRED, MISSING = "observed", "inferred", "missing"
+"""Values of `Person.source`."""
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One moment of an RGB-D camera, as the sensor gives it."""
+
+    color: UInt8[np.ndarray, "h w 3"]
+    """RGB"""
+    depth: Float32[np.ndarray, "hd wd"]
+    """z in metres in the depth camera's pixels; 0 = no measurement"""
+    camera: RGBDCamera
+    index: int = 0
+    """number of the frame in its recording"""
+    timestamp_s: float | None = None
+    """seconds on the recording's clock; None where it has none"""
+
+    def __post_init__(self) -> None:
+        c, d = self.camera.color, self.camera.depth
+        if self.color.dtype != np.uint8 or self.color.shape != (c.height, c.width, 3):
+            raise FrameError(
+                f"frame {self.index}: color must be 8-bit RGB of shape {(c.height, c.width, 3)} as its camera says, "
+                f"got {self.color.dtype} {self.color.shape}"
+            )
+        if self.depth.dtype != np.float32 or self.depth.shape != (d.height, d.width):
+            raise FrameError(
+                f"frame {self.index}: depth must be float32 metres of shape {(d.height, d.width)} as its camera says, "
+                f"got {self.depth.dtype} {self.depth.shape}"
+            )
+        if not np.isfinite(self.depth).all() or (self.depth.size and self.depth.min() < 0):
+            raise FrameError(
+                f"frame {self.index}: depth holds NaN, infinite or negative values; 'no measurement' is 0"
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class RegisteredDepth:
+    """Depth in the colour camera's frame and pixels (up to a uniform scale). Making one states that it is so."""
+
+    z: Float32[np.ndarray, "hd wd"]
+    """metres along the colour camera's z; 0 = no measurement; may be sparse"""
+    camera: Camera
+    """the colour camera, resized to the depth image"""
+
+    def __post_init__(self) -> None:
+        if self.z.shape != (self.camera.height, self.camera.width):
+            raise FrameError(
+                f"registered depth of shape {self.z.shape} does not fit its camera ({self.camera.height}, {self.camera.width})"
+            )
+
+    def scale_to(self, color: Camera) -> float:
+        """Depth pixels per colour pixel."""
+        return self.camera.width / color.width
+
+
+@dataclass(frozen=True, eq=False)
+class RegisteredFrame:
+    """Colour and depth that share one viewpoint. `understudy.registration.register` makes it from a `Frame`."""
+
+    color: UInt8[np.ndarray, "h w 3"]
+    """RGB"""
+    camera: Camera
+    """the colour camera"""
+    depth: RegisteredDepth
+    index: int = 0
+    timestamp_s: float | None = None
+
+    def __post_init__(self) -> None:
+        check_registered(self.camera, self.depth.camera)
+
+
+@dataclass(frozen=True, eq=False)
+class Keypoints2D:
+    """One person's keypoints in the colour image."""
+
+    uv: Float[np.ndarray, "18 2"]
+    """colour pixels; (0, 0) where not found"""
+    score: Float[np.ndarray, "18"]
+    """in [0, 1]; 0 where not found"""
+    torso_z: float | None = None
+    """metres: depth of the person's torso surface, where the detector saw one"""
+
+    def __post_init__(self) -> None:
+        assert self.uv.shape == (N_JOINTS, 2) and self.score.shape == (N_JOINTS,)
+
+    @property
+    def found(self) -> np.ndarray:
+        """Which joints have a 2D position; shape (18,), bool."""
+        return self.score > 0
+
+    @classmethod
+    def from_rows(cls, rows: Float[np.ndarray, "18 3"]) -> Keypoints2D:
+        """From rows (u, v, score); a score of 0 (or less) means not found."""
+        return cls.where(rows[:, :2], rows[:, 2])
+
+    @classmethod
+    def where(cls, uv: np.ndarray, score: np.ndarray, torso_z: float | None = None) -> Keypoints2D:
+        """Keypoints with the position of those that have no score set to (0, 0)."""
+        score = np.clip(np.asarray(score, dtype=np.float64), 0.0, 1.0)
+        return cls(np.where(score[:, None] > 0, np.asarray(uv, dtype=np.float64), 0.0), score, torso_z)
+
+    def rows(self) -> Float[np.ndarray, "18 3"]:
+        """Rows (u, v, score)."""
+        return np.column_stack([self.uv, self.score])
+
+
+@dataclass(frozen=True, eq=False)
+class Palm:
+    """The direction of a palm."""
+
+    normal: Float[np.ndarray, "3"]
+    """unit vector out of the palm, colour camera's frame"""
+    confidence: float
+    """probability that the normal is within 30 degrees of the truth"""
+
+
+@dataclass(frozen=True, eq=False)
+class Person:
+    """One person in one frame, in the colour camera's frame."""
+
+    keypoints_2d: Keypoints2D
+    keypoints: Float[np.ndarray, "18 3"]
+    """metres; NaN rows where the method cannot give a joint"""
+    confidence: Float[np.ndarray, "18"]
+    """probability that the joint is within 10 cm of the truth; 0 where missing"""
+    sigma_m: Float[np.ndarray, "18"]
+    """one standard deviation of the position, isotropic, metres; NaN where missing"""
+    source: tuple[str, ...]
+    """per joint: observed, inferred or missing"""
+    id: int = 0
+    """stays with the person through a recording"""
+    hands: dict[str, Palm | None] = field(default_factory=lambda: {"left": None, "right": None})
+    failed: str | None = None
+    """why a detected person has no 3D keypoints at all; None when there are some"""
+
+    def __post_init__(self) -> None:
+        assert self.keypoints.shape == (N_JOINTS, 3) and len(self.source) == N_JOINTS
+
+    @classmethod
+    def failure(cls, keypoints_2d: Keypoints2D, why: str) -> Person:
+        """A person who was detected but could not be lifted."""
+        nothing = np.full(N_JOINTS, np.nan)
+        return cls(
+            keypoints_2d,
+            np.full((N_JOINTS, 3), np.nan),
+            np.zeros(N_JOINTS),
+            nothing,
+            (MISSING,) * N_JOINTS,
+            failed=why,
+        )
+
+    def with_id(self, id: int) -> Person:
+        return replace(self, id=id)
