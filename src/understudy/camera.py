@@ -52,9 +52,7 @@ class Camera:
         if abs(K[0, 1]) > 1e-9 or np.abs(K[[1, 2, 2], [0, 0, 1]]).max() > 1e-9 or abs(K[2, 2] - 1) > 1e-9:
             raise CameraError("K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
         if self.distortion_model not in DISTORTION_MODELS:
-            raise CameraError(
-                f"distortion_model {self.distortion_model!r}: must be {one_of(DISTORTION_MODELS)}"
-            )
+            raise CameraError(f"distortion_model {self.distortion_model!r}: must be {one_of(DISTORTION_MODELS)}")
         n = DISTORTION_MODELS[self.distortion_model]
         if len(coefficients) != n or not np.isfinite(coefficients).all():
             raise CameraError(
@@ -99,9 +97,7 @@ class Camera:
             xy = np.where((z > 0)[..., None], points[..., :2] / z[..., None], np.nan)
             return self.distort(xy) * (self.fx, self.fy) + (self.cx, self.cy)
 
-    def unproject(
-        self, uv: Float[np.ndarray, "*n 2"], z: Float[np.ndarray, "*n"] | float
-    ) -> Float[np.ndarray, "*n 3"]:
+    def unproject(self, uv: Float[np.ndarray, "*n 2"], z: Float[np.ndarray, "*n"] | float) -> Float[np.ndarray, "*n 3"]:
         """Pixels (u, v) and their z (metres) -> points (metres, camera frame)."""
         xy = self.normalized(uv)
         depth = np.broadcast_to(np.asarray(z, dtype=np.float64), xy.shape[:-1])
@@ -125,7 +121,7 @@ class Camera:
 
     @cached_property
     def max_radius(self) -> float:
-        """Largest undistorted radius (X/Z) before the radial mapping r -> r * radial(r) folds back or has a pole; inf if never."""
+        """Largest undistorted radius (X/Z) before the radial mapping folds back or has a pole; inf if never."""
         if not self.distorted:
             return float("inf")
         k1, k2, _, _, k3, k4, k5, k6 = self._k
@@ -189,9 +185,7 @@ class Camera:
         s = r * r
         rd = r * (1 + s * (k1 + s * (k2 + s * k3))) / (1 + s * (k4 + s * (k5 + s * k6)))
         undistorted = np.interp(distorted_radius, rd, r)
-        return np.divide(
-            undistorted, distorted_radius, out=np.ones_like(undistorted), where=distorted_radius > 1e-9
-        )
+        return np.divide(undistorted, distorted_radius, out=np.ones_like(undistorted), where=distorted_radius > 1e-9)
 
     def _distortion_jacobian(self, xy: np.ndarray) -> np.ndarray:
         """d distort / d (x, y), shape (*n, 2, 2)."""
@@ -248,9 +242,7 @@ class Camera:
             raise CameraError(f"{where}: distortion must be a list, got {coefficients!r}")
         try:
             K = np.array(data["K"], dtype=np.float64)
-            return cls(
-                data["width"], data["height"], K, data.get("distortion_model") or "none", tuple(coefficients)
-            )
+            return cls(data["width"], data["height"], K, data.get("distortion_model") or "none", tuple(coefficients))
         except (TypeError, ValueError) as e:
             raise CameraError(f"{where}: {e}") from e
 
@@ -287,9 +279,7 @@ class RGBDCamera:
     def __post_init__(self) -> None:
         T = np.asarray(self.T_color_depth, dtype=np.float64)
         if T.shape != (4, 4) or not is_rigid(T):
-            raise CameraError(
-                "T_color_depth must be a 4x4 rigid transform (orthonormal rotation, last row 0 0 0 1)"
-            )
+            raise CameraError("T_color_depth must be a 4x4 rigid transform (orthonormal rotation, last row 0 0 0 1)")
         T.setflags(write=False)
         object.__setattr__(self, "T_color_depth", T)
         if self.registered:
@@ -304,18 +294,14 @@ class RGBDCamera:
 
 
 def check_registered(color: Camera, depth: Camera) -> None:
-    """Raises CameraError unless `depth` is `color` resized by a uniform scale (one part in 200, half a pixel)."""
+    """Raises CameraError unless `depth` is `color` resized by a uniform scale (0.5 %, one pixel)."""
     ideal = color.resize(depth.width, depth.height)
     ratio = (depth.width / color.width) / (depth.height / color.height)
     tolerance = np.array([0.005 * ideal.fx, 0.005 * ideal.fy, 1.0, 1.0])
     difference = np.abs([depth.fx - ideal.fx, depth.fy - ideal.fy, depth.cx - ideal.cx, depth.cy - ideal.cy])
-    if (
-        abs(ratio - 1) > 0.01
-        or (difference > tolerance).any()
-        or depth.distortion_model != color.distortion_model
-    ):
+    if abs(ratio - 1) > 0.01 or (difference > tolerance).any() or depth.distortion_model != color.distortion_model:
         raise CameraError(
-            "depth.registered is true, so depth's K must be color's K scaled uniformly and its distortion the same: expected about "
-            f"fx {ideal.fx:.1f} fy {ideal.fy:.1f} cx {ideal.cx:.1f} cy {ideal.cy:.1f} at {depth.width} x {depth.height}, "
-            f"got fx {depth.fx:.1f} fy {depth.fy:.1f} cx {depth.cx:.1f} cy {depth.cy:.1f}"
+            "depth.registered is true, so depth's K must be color's K scaled uniformly and its distortion the same: "
+            f"expected about fx {ideal.fx:.1f} fy {ideal.fy:.1f} cx {ideal.cx:.1f} cy {ideal.cy:.1f} "
+            f"at {depth.width} x {depth.height}, got fx {depth.fx:.1f} fy {depth.fy:.1f} cx {depth.cx:.1f} cy {depth.cy:.1f}"
         )

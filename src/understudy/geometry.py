@@ -4,9 +4,7 @@ import numpy as np
 from jaxtyping import Float
 
 
-def transform_points(
-    T_a_b: Float[np.ndarray, "4 4"], points_b: Float[np.ndarray, "*n 3"]
-) -> Float[np.ndarray, "*n 3"]:
+def transform_points(T_a_b: Float[np.ndarray, "4 4"], points_b: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
     """Points (metres) in frame b -> the same points in frame a."""
     return points_b @ T_a_b[:3, :3].T + T_a_b[:3, 3]
 

@@ -116,11 +116,7 @@ def _person_from_json(data: Any, where: str) -> Person:
     if "failed" in data:
         return Person.failure(keypoints_2d, str(data["failed"])).with_id(id)
     source = data.get("source")
-    if (
-        not isinstance(source, list)
-        or len(source) != N_JOINTS
-        or not set(source) <= {OBSERVED, INFERRED, MISSING}
-    ):
+    if not isinstance(source, list) or len(source) != N_JOINTS or not set(source) <= {OBSERVED, INFERRED, MISSING}:
         raise RecordingError(f"{where}.source: must be 18 of {OBSERVED}, {INFERRED}, {MISSING}")
     hands = {
         side: _palm_from_json((data.get("hands") or {}).get(side), f"{where}.hands.{side}")
@@ -156,9 +152,9 @@ def rows_from_json(data: Any, n: int, where: str) -> np.ndarray:
     if not isinstance(data, Sequence) or len(data) != N_JOINTS:
         raise RecordingError(f"{where}: must be a list of {N_JOINTS} rows")
     try:
-        return np.array(
-            [[np.nan] * n if r is None else [float(x) for x in r] for r in data], dtype=np.float64
-        ).reshape(18, n)
+        return np.array([[np.nan] * n if r is None else [float(x) for x in r] for r in data], dtype=np.float64).reshape(
+            18, n
+        )
     except (TypeError, ValueError) as e:
         raise RecordingError(f"{where}: each row must be {n} numbers or null ({e})") from e
 

@@ -1,9 +1,10 @@
 """Depth -> colour registration: depth pixels become points, are moved to the colour camera, and z-buffered there.
 
-What the colour camera cannot see must not show through: seen from a second viewpoint, a near surface is a net of samples with gaps, and
-samples of what lies behind it fall into the gaps. A closing of the z-buffer (a dilation, then an erosion, of nearness) bridges the gaps
-inside a surface but not its outline; samples clearly behind the bridged surface are dropped. No value is made up: each value in the
-result is the z of one measured point, in the pixel it projects to, and pixels that no point meets stay 0.
+What the colour camera cannot see must not show through. Seen from a second viewpoint a near surface is a net of
+samples with gaps, and samples of what lies behind it fall into the gaps. A closing of the z-buffer (a dilation, then
+an erosion, of nearness) bridges the gaps inside a surface but does not widen its outline; samples clearly behind the
+bridged surface are dropped. No value is made up: each value in the result is the z of one measured point, in the
+pixel that it projects to, and pixels that no point meets stay 0.
 """
 
 from __future__ import annotations
@@ -30,9 +31,7 @@ class DepthRegistration:
     def __init__(self, camera: RGBDCamera):
         self.camera = camera
         depth = camera.depth
-        u, v = np.meshgrid(
-            np.arange(depth.width, dtype=np.float64), np.arange(depth.height, dtype=np.float64)
-        )
+        u, v = np.meshgrid(np.arange(depth.width, dtype=np.float64), np.arange(depth.height, dtype=np.float64))
         xy = depth.normalized(np.stack([u, v], axis=-1).reshape(-1, 2))
         R, t = camera.T_color_depth[:3, :3], camera.T_color_depth[:3, 3]
         rays = np.column_stack([xy, np.ones(len(xy))]) @ R.T
@@ -48,16 +47,14 @@ class DepthRegistration:
     def __call__(self, depth: Float32[np.ndarray, "hd wd"]) -> Float32[np.ndarray, "h w"]:
         """Depth (metres, depth camera) -> z (metres, colour camera) in the colour image; 0 = no measurement."""
         color, d = self.camera.color, depth.ravel()
-        nearest = np.full(
-            color.height * color.width + 1, _FAR, np.float32
-        )  # the last cell takes what is outside
+        nearest = np.full(color.height * color.width + 1, _FAR, np.float32)  # the last cell takes what is outside
         for block in self._blocks:
             z, pixel = self._project(d[block], self._rays[:, block])
             np.minimum.at(nearest, pixel, z)
         return self._without_hidden(nearest[:-1].reshape(color.height, color.width))
 
     def _project(self, d: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """z in the colour camera and flat pixel index of each sample; float32 and in place, since this is the hot path."""
+        """z in the colour camera and flat pixel index of each sample. Float32, in place: the hot path."""
         color, (tx, ty, tz) = self.camera.color, self._t
         with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
             z = rays[2] * d
@@ -85,9 +82,8 @@ class DepthRegistration:
     def _without_hidden(self, nearest: np.ndarray) -> np.ndarray:
         """Zero where nothing was measured, and where what was measured lies behind the bridged surface."""
         # erode then dilate distance = dilate then erode nearness
-        limit = cv2.morphologyEx(nearest, cv2.MORPH_OPEN, self._bridge)
-        limit *= 1 + HIDDEN_MARGIN
-        limit += 0.02
+        bridged = cv2.morphologyEx(nearest, cv2.MORPH_OPEN, self._bridge)
+        limit = bridged * np.float32(1 + HIDDEN_MARGIN) + np.float32(0.02)
         nearest[(nearest > limit) | (nearest == _FAR)] = 0
         return nearest
 
@@ -98,7 +94,7 @@ def _registration(camera: RGBDCamera) -> DepthRegistration:
 
 
 def register(frame: Frame) -> RegisteredFrame:
-    """The frame with its depth in the colour camera's frame and pixels. Depth that is registered already passes through."""
+    """The frame with its depth in the colour camera's frame and pixels. Registered depth passes through."""
     if frame.camera.registered:
         depth = RegisteredDepth(frame.depth, frame.camera.depth)
     else:

@@ -42,9 +42,7 @@ BONES: Final = tuple(
 )  # fmt: skip
 """Pairs of rows that a drawing joins."""
 
-FLIP: Final = np.array(
-    [JOINT[n.replace("left", "LR").replace("right", "left").replace("LR", "right")] for n in JOINTS]
-)
+FLIP: Final = np.array([JOINT[n.replace("left", "LR").replace("right", "left").replace("LR", "right")] for n in JOINTS])
 """`keypoints[FLIP]` exchanges left and right."""
 
 TORSO: Final = rows("neck", "right_shoulder", "left_shoulder", "right_hip", "left_hip")

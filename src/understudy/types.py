@@ -42,9 +42,7 @@ class Frame:
                 f"got {self.depth.dtype} {self.depth.shape}"
             )
         if not np.isfinite(self.depth).all() or (self.depth.size and self.depth.min() < 0):
-            raise FrameError(
-                f"frame {self.index}: depth holds NaN, infinite or negative values; 'no measurement' is 0"
-            )
+            raise FrameError(f"frame {self.index}: depth holds NaN, infinite or negative values; 'no measurement' is 0")
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +57,8 @@ class RegisteredDepth:
     def __post_init__(self) -> None:
         if self.z.shape != (self.camera.height, self.camera.width):
             raise FrameError(
-                f"registered depth of shape {self.z.shape} does not fit its camera ({self.camera.height}, {self.camera.width})"
+                f"registered depth of shape {self.z.shape} does not fit its camera "
+                f"({self.camera.height}, {self.camera.width})"
             )
 
     def scale_to(self, color: Camera) -> float:
