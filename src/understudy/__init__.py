@@ -27,7 +27,17 @@ _LAZY = {
     "UnderstudyError": "understudy.errors",
 }
 
-__all__ = [*_LAZY, "__version__", "recordings"]
+__all__ = [
+    "Camera",
+    "Estimator",
+    "Frame",
+    "Keypoints2D",
+    "Person",
+    "RGBDCamera",
+    "UnderstudyError",
+    "__version__",
+    "recordings",
+]
 
 
 def __getattr__(name: str) -> Any:

@@ -303,5 +303,6 @@ def check_registered(color: Camera, depth: Camera) -> None:
         raise CameraError(
             "depth.registered is true, so depth's K must be color's K scaled uniformly and its distortion the same: "
             f"expected about fx {ideal.fx:.1f} fy {ideal.fy:.1f} cx {ideal.cx:.1f} cy {ideal.cy:.1f} "
-            f"at {depth.width} x {depth.height}, got fx {depth.fx:.1f} fy {depth.fy:.1f} cx {depth.cx:.1f} cy {depth.cy:.1f}"
+            f"at {depth.width} x {depth.height}; got "
+            f"fx {depth.fx:.1f} fy {depth.fy:.1f} cx {depth.cx:.1f} cy {depth.cy:.1f}"
         )

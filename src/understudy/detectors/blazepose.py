@@ -1,0 +1,232 @@
+"""The default detector: BlazePose's networks on every person of the image, steered and checked by depth.
+
+In order: things in the depth -> windows -> candidates -> three looks at each (as seen; with other people hidden; the
+same mirrored) -> agreement of the looks and of the depth under them -> people.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from understudy.assets import model_path
+from understudy.camera import Camera
+from understudy.detectors.blazepose_nets import DETECTOR_SIZE, LANDMARK_SIZE, BlazePoseNets, Landmarks, Region
+from understudy.detectors.windows import Scene, windows
+from understudy.skeleton import FACE, JOINT, TORSO, to_coco18
+from understudy.types import Keypoints2D, RegisteredDepth
+
+_ON_PERSON, _UNMEASURED, _BEHIND_OTHER, _OFF_PERSON = 1.0, 0.9, 0.35, 0.25
+"""What a keypoint's place is worth: on its person, in a depth hole, hidden by something nearer, on the background"""
+_SHOULDERS, _HIPS = TORSO[1:3], TORSO[3:5]
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """Somebody, before the landmarks."""
+
+    score: float
+    region: Region
+    hip: Float[np.ndarray, "2"]
+    torso: float
+    """mid hip to mid shoulder, pixels"""
+    group: int
+    """index of the thing in the depth image, -1 if none"""
+
+
+class BlazePoseDetector:
+    """All people of an image; with depth, also when they overlap."""
+
+    name = "blazepose"
+
+    def __init__(self, min_score: float = 0.5, threads: int = 2):
+        """min_score: least probability that a region holds a person. threads: networks that run at a time."""
+        self.min_score = min_score
+        self._nets = BlazePoseNets(model_path("pose_detection"), model_path("pose_landmark_full"), threads)
+
+    def detect(
+        self, color: UInt8[np.ndarray, "h w 3"], depth: RegisteredDepth | None = None, index: int = 0
+    ) -> list[Keypoints2D]:
+        """People in an RGB image (see `Detector.detect`)."""
+        scene = self._scene(color, depth)
+        candidates = distinct(self._candidates(color, scene))
+        looks = self._looks(color, scene, candidates)
+        height, width = color.shape[:2]
+        people = [
+            self._fuse(scene, candidate, [_coco(look, width, height) for look in three])
+            for candidate, three in zip(candidates, looks, strict=True)
+            if max(look.score for look in three) >= self.min_score
+        ]
+        return merge_duplicates(people)
+
+    @staticmethod
+    def _scene(color: np.ndarray, depth: RegisteredDepth | None) -> Scene | None:
+        if depth is None or not depth.z.any():
+            return None
+        height, width = color.shape[:2]
+        return Scene(depth, depth.camera.resize(width, height))
+
+    def _candidates(self, color: np.ndarray, scene: Scene | None) -> list[Candidate]:
+        """Everybody whom the detection network sees in some window; the same person many times."""
+        looks = windows(color.shape[1], color.shape[0], scene)
+        crops = []
+        for look in looks:
+            crop = look.region.crop(color, DETECTOR_SIZE)
+            if scene is not None and look.group is not None:
+                crop = scene.hide(crop, look.region, scene.hidden(look.group))
+            crops.append(crop)
+        out = []
+        for look, rows in zip(looks, self._nets.detect(crops), strict=True):
+            A = look.region.to_image(DETECTOR_SIZE)
+            for row in rows:
+                hip, rim, shoulder, _ = row[1:].reshape(4, 2) @ A[:, :2].T + A[:, 2]
+                torso = float(np.linalg.norm(hip - shoulder))
+                group = -1 if scene is None else _group_between(scene, hip, shoulder)
+                if look.group is not None and group not in (-1, look.group):
+                    continue  # somebody else, whose own window shows them better
+                bonus = 1.0 if look.group is not None else 0.0
+                out.append(Candidate(float(row[0]) + bonus, Region.from_points(hip, rim), hip, torso, group))
+        return out
+
+    def _looks(
+        self, color: np.ndarray, scene: Scene | None, candidates: list[Candidate]
+    ) -> list[tuple[Landmarks, Landmarks, Landmarks]]:
+        """Three looks at each candidate: as seen; again from a better region, with other people hidden where depth
+        tells them apart; and once more from a still better region, mirrored.
+        """
+        regions = [c.region for c in candidates]
+        plain = self._nets.landmarks([r.crop(color, LANDMARK_SIZE) for r in regions], regions)
+        hidden = [scene.hidden(c.group) if scene is not None and c.group >= 0 else None for c in candidates]
+        # under an overlap the first look may have followed the other person: keep the detector's region there
+        overlap = [
+            scene is not None and h is not None and scene.shows(c.region, h)
+            for c, h in zip(candidates, hidden, strict=True)
+        ]
+        regions = [c.region if o else look.next_region for c, o, look in zip(candidates, overlap, plain, strict=True)]
+        checked = self._nets.landmarks(self._masked(color, scene, regions, hidden), regions)
+        regions = [look.next_region for look in checked]
+        mirrored = self._nets.landmarks(self._masked(color, scene, regions, hidden), regions, mirrored=True)
+        return list(zip(plain, checked, mirrored, strict=True))
+
+    @staticmethod
+    def _masked(
+        color: np.ndarray, scene: Scene | None, regions: list[Region], hidden: list[np.ndarray | None]
+    ) -> list[np.ndarray]:
+        crops = [r.crop(color, LANDMARK_SIZE) for r in regions]
+        if scene is None:
+            return crops
+        return [c if h is None else scene.hide(c, r, h) for c, r, h in zip(crops, regions, hidden, strict=True)]
+
+    @staticmethod
+    def _fuse(scene: Scene | None, candidate: Candidate, looks: list[Float[np.ndarray, "18 3"]]) -> Keypoints2D:
+        """One person from the three looks. The masked ones place the joints; the plain one can only lower a score."""
+        plain, checked, mirrored = looks
+        torso = max(_torso_length(checked), 0.5 * candidate.torso, 1.0)
+        torso_z, place = None, np.ones((2, len(checked)))
+        if scene is not None:
+            torso_z = _torso_depth(scene, candidate, checked)
+            place = np.stack([_places(scene, candidate.group, torso_z, k[:, :2]) for k in (checked, mirrored)])
+        apart = np.linalg.norm(checked[:, :2] - mirrored[:, :2], axis=1) / torso
+        weight = place * np.stack([checked[:, 2], mirrored[:, 2]])
+        together = (apart < 0.2) & (place[0] == place[1])
+        choice = np.where(together, 0.5, weight[1] > weight[0])[:, None]
+        rows = (1 - choice) * checked + choice * mirrored
+        place = np.where(choice[:, 0] > 0.5, place[1], place[0])
+        from_plain = np.linalg.norm(rows[:, :2] - plain[:, :2], axis=1) / torso
+        rows[:, 2] *= place * _agreement(apart, 0.2) * _agreement(from_plain, 0.4)
+        rows[JOINT["neck"], :2] = rows[_SHOULDERS, :2].mean(0)
+        rows[JOINT["neck"], 2] = rows[_SHOULDERS, 2].min()
+        return Keypoints2D.where(rows[:, :2], rows[:, 2], torso_z)
+
+
+def _torso_length(rows: np.ndarray) -> float:
+    """Mid shoulders to mid hips, pixels."""
+    return float(np.linalg.norm(rows[_SHOULDERS, :2].mean(0) - rows[_HIPS, :2].mean(0)))
+
+
+def _agreement(apart: np.ndarray, least: float) -> np.ndarray:
+    """1 for looks within 8 % of a torso length of each other, falling to `least` when they are far apart."""
+    return least + (1 - least) * np.exp(-((np.maximum(apart - 0.08, 0) / 0.25) ** 2))
+
+
+def _coco(landmarks: Landmarks, width: int, height: int) -> Float[np.ndarray, "18 3"]:
+    """COCO-18 rows (u, v, score); score 0 outside the image."""
+    score = landmarks.visibility * landmarks.presence
+    rows = to_coco18(np.column_stack([landmarks.uv, score]), "blazepose")
+    camera = Camera(width, height, np.eye(3))
+    rows[~camera.contains(rows[:, :2]), 2] = 0
+    return rows
+
+
+def _group_between(scene: Scene, hip: np.ndarray, shoulder: np.ndarray) -> int:
+    """The group under most of the line from hip to shoulder, -1 if there is none."""
+    t = np.linspace(0.1, 0.9, 9)[:, None]
+    groups = scene.groups_at(hip + t * (shoulder - hip))
+    names, counts = np.unique(groups[groups >= 0], return_counts=True)
+    return int(names[np.argmax(counts)]) if len(names) else -1
+
+
+def _torso_depth(scene: Scene, candidate: Candidate, rows: np.ndarray) -> float | None:
+    """Median depth (metres) of the person's own cells between shoulders and hips; None where nothing was measured."""
+    corners = rows[TORSO[1:], :2]
+    weights = np.random.default_rng(0).dirichlet(np.ones(4), 60)
+    row, col, inside = scene.grid.cells_of(weights @ corners)
+    z = scene.grid.z[row, col]
+    good = inside & (z > 0)
+    own = good & (scene.group_of_cell[row, col] == candidate.group)
+    chosen = own if own.sum() >= 3 and candidate.group >= 0 else good
+    return float(np.median(z[chosen])) if chosen.any() else None
+
+
+def _places(scene: Scene, group: int, torso_z: float | None, uv: Float[np.ndarray, "18 2"]) -> Float[np.ndarray, "18"]:
+    """What the place of each keypoint is worth (the constants at the head of this file)."""
+    if torso_z is None:
+        return np.full(len(uv), _UNMEASURED)
+    grid = scene.grid
+    row, col, _ = grid.cells_of(uv)
+    offsets = np.array([(0, 0), (-1, 0), (1, 0), (0, -1), (0, 1)])
+    rows = (row[:, None] + offsets[:, 0]).clip(0, grid.z.shape[0] - 1)
+    cols = (col[:, None] + offsets[:, 1]).clip(0, grid.z.shape[1] - 1)
+    z, groups = grid.z[rows, cols], scene.group_of_cell[rows, cols]
+    near = (z > 0) & (np.abs(z - torso_z) < 0.9)
+    on = ((groups == group) if group >= 0 else near).any(1)
+    on |= near.any(1) & ~(groups >= 0).any(1)  # small parts cut off, and feet that merge with the floor
+    unmeasured = (z == 0).all(1)
+    nearer = ((z > 0) & (z < torso_z - 0.25)).any(1)
+    return np.select([on, unmeasured, nearer], [_ON_PERSON, _UNMEASURED, _BEHIND_OTHER], _OFF_PERSON)
+
+
+def distinct(candidates: list[Candidate]) -> list[Candidate]:
+    """The best candidate of each person: best first, others dropped whose hips are close for their size."""
+    out: list[Candidate] = []
+    for c in sorted(candidates, key=lambda c: -c.score):
+        if not any(_same(c, kept) for kept in out):
+            out.append(c)
+    return out
+
+
+def _same(a: Candidate, b: Candidate) -> bool:
+    distance = float(np.linalg.norm(a.hip - b.hip) / max(a.torso, b.torso, 1.0))
+    if a.group != b.group and a.group >= 0 and b.group >= 0:
+        return distance < 0.1
+    return distance < 0.5
+
+
+def merge_duplicates(people: list[Keypoints2D]) -> list[Keypoints2D]:
+    """Drops the weaker of two whose confident joints coincide (median distance under a quarter of a torso)."""
+    out: list[Keypoints2D] = []
+    for p in sorted(people, key=lambda p: -p.score.sum()):
+        if (p.score > 0.2).sum() >= 4 and not any(_coincide(p, q) for q in out):
+            out.append(p)
+    return out
+
+
+def _coincide(p: Keypoints2D, q: Keypoints2D) -> bool:
+    body = np.setdiff1d(np.arange(18), FACE)
+    both = body[(p.score[body] > 0) & (q.score[body] > 0)]
+    if len(both) < 3:
+        return False
+    apart = float(np.median(np.linalg.norm(p.uv[both] - q.uv[both], axis=1)))
+    return apart < 0.25 * max(_torso_length(q.uv), 1.0)

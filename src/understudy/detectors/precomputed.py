@@ -1,0 +1,109 @@
+"""Detectors that look up 2D keypoints which somebody computed before."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import UInt8
+
+from understudy.errors import DetectorError, one_of
+from understudy.skeleton import LAYOUTS, to_coco18
+from understudy.types import Keypoints2D, RegisteredDepth
+
+
+class RecordingKeypoints:
+    """The recording's own `keypoints2d.json`."""
+
+    name = "recording"
+
+    def __init__(self, keypoints: Mapping[int, Sequence[Keypoints2D]] | None, where: str = "the recording"):
+        """keypoints: people by frame index. Raises DetectorError when there are none at all."""
+        if keypoints is None:
+            raise DetectorError(
+                f"{where} has no keypoints2d.json, which detector 'recording' reads; use --detector blazepose"
+            )
+        self._keypoints = keypoints
+
+    def detect(
+        self, color: UInt8[np.ndarray, "h w 3"], depth: RegisteredDepth | None = None, index: int = 0
+    ) -> list[Keypoints2D]:
+        """People of frame `index` (see `Detector.detect`)."""
+        return list(self._keypoints.get(index, ()))
+
+
+class OpenPoseJson:
+    """A folder of OpenPose's `--write_json` output: one file a frame, the frame's number last in its name."""
+
+    name = "openpose-json"
+
+    def __init__(self, folder: Path, layout: str = "auto"):
+        """layout: the skeleton (`skeleton.LAYOUTS`), or auto: by the number of keypoints and where the neck is."""
+        self.folder = Path(folder)
+        if layout != "auto" and layout not in LAYOUTS:
+            raise DetectorError(f"openpose-json layout {layout!r}: must be {one_of(['auto', *LAYOUTS])}")
+        if not self.folder.is_dir():
+            raise DetectorError(f"{folder}: no such folder of OpenPose JSON files")
+        self._files: dict[int, Path] = {}
+        for path in sorted(self.folder.glob("*.json")):
+            numbers = re.findall(r"\d+", path.stem)
+            if not numbers:
+                raise DetectorError(f"{path}: no frame number in the file's name")
+            if int(numbers[-1]) in self._files:
+                raise DetectorError(f"{path} and {self._files[int(numbers[-1])].name}: the same frame number twice")
+            self._files[int(numbers[-1])] = path
+        if not self._files:
+            raise DetectorError(f"{folder}: holds no .json files")
+        self.layout = layout if layout != "auto" else self._guess_layout()
+
+    def detect(
+        self, color: UInt8[np.ndarray, "h w 3"], depth: RegisteredDepth | None = None, index: int = 0
+    ) -> list[Keypoints2D]:
+        """People of the file of frame `index`; nobody where there is no file (OpenPose writes one for every frame)."""
+        path = self._files.get(index)
+        if path is None:
+            raise DetectorError(f"{self.folder}: no file for frame {index}")
+        return [self._person(rows, path) for rows in _read(path)]
+
+    def _person(self, rows: np.ndarray, path: Path) -> Keypoints2D:
+        if len(rows) != LAYOUTS[self.layout][0]:
+            raise DetectorError(
+                f"{path}: pose_keypoints_2d has {len(rows)} keypoints, but layout {self.layout!r} has "
+                f"{LAYOUTS[self.layout][0]}"
+            )
+        return Keypoints2D.from_rows(to_coco18(rows, self.layout))
+
+    def _guess_layout(self) -> str:
+        """By the number of keypoints; among those with 25, BODY_25 has its neck (row 1) between rows 2 and 5."""
+        for path in self._files.values():
+            for rows in _read(path):
+                fitting = [name for name, (n, _) in LAYOUTS.items() if n == len(rows) and name != "blazepose"]
+                if not fitting:
+                    sizes = sorted({n for n, _ in LAYOUTS.values()})
+                    raise DetectorError(f"{path}: pose_keypoints_2d has {len(rows)} keypoints; known: {sizes}")
+                if len(fitting) == 1:
+                    return fitting[0]
+                if (rows[[1, 2, 5, 6, 8, 11], 2] > 0.1).all():
+                    xy = rows[:, :2]
+                    width = max(float(np.ptp(xy[rows[:, 2] > 0], axis=0).max()), 1.0)
+                    gap = float(np.linalg.norm(xy[1] - (xy[2] + xy[5]) / 2))
+                    return "body_25" if gap < 0.06 * width else "body_25b"
+        return "body_25"
+
+
+def _read(path: Path) -> list[np.ndarray]:
+    """The n x 3 keypoints of each person of one file."""
+    try:
+        people = json.loads(path.read_text())["people"]
+        rows = [np.array(p["pose_keypoints_2d"], dtype=np.float64).reshape(-1, 3) for p in people]
+    except (OSError, UnicodeDecodeError, ValueError, KeyError, TypeError) as e:
+        raise DetectorError(
+            f"{path}: not OpenPose's JSON (people[].pose_keypoints_2d, triples u v score): {e!r}"
+        ) from e
+    for r in rows:
+        if not np.isfinite(r).all():
+            raise DetectorError(f"{path}: pose_keypoints_2d holds values that are not finite")
+    return [r for r in rows if (r[:, 2] > 0).any()]

@@ -1,0 +1,153 @@
+"""Where to look for people, and what to hide while looking.
+
+With depth: a window around each thing that could be a person, other such things greyed out of it; and a few large tiles
+for people that depth does not show or does not separate from the furniture. Without depth: tiles of three sizes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from understudy.camera import Camera
+from understudy.detectors.blazepose_nets import Region
+from understudy.detectors.components import Component, DepthGrid
+from understudy.types import RegisteredDepth
+
+_MARGIN = 1.25  # window side over the larger side of the thing
+_FILL = 128  # grey level of what is hidden
+
+
+@dataclass(frozen=True)
+class Group:
+    """Components that are likely one thing: a person whose head and chest are cut apart by an arm or a hole."""
+
+    labels: frozenset[int]
+    box: tuple[float, float, float, float]
+    """left, top, right, bottom, colour pixels"""
+    z: float
+    """median depth of the largest part, metres"""
+    compact: bool
+    """could be one person, or a few who touch; else it is furniture, a wall, a person joined to them"""
+
+
+@dataclass(frozen=True)
+class Window:
+    """One look at the image."""
+
+    region: Region
+    group: int | None
+    """the group it is about; None for a tile"""
+
+
+class Scene:
+    """The things in one frame's depth, as far as the detector needs them."""
+
+    def __init__(self, depth: RegisteredDepth, color: Camera):
+        self.grid = DepthGrid(depth, color)
+        self.groups = _merge(self.grid.components)
+        self._group_of_label = np.full(int(self.grid.labels.max(initial=0)) + 1, -1)
+        for i, group in enumerate(self.groups):
+            self._group_of_label[list(group.labels)] = i
+        self.group_of_cell = self._group_of_label[self.grid.labels]
+        """(gh, gw) index into `groups`, -1 for none"""
+
+    def hidden(self, group: int) -> Bool[np.ndarray, "gh gw"]:
+        """Cells of the other groups that could be people."""
+        others = [i for i, g in enumerate(self.groups) if g.compact and i != group]
+        return np.isin(self.group_of_cell, others)
+
+    def groups_at(self, uv: Float[np.ndarray, "n 2"]) -> np.ndarray:
+        """Group under each pixel, -1 for none; shape (n,)."""
+        row, col, inside = self.grid.cells_of(uv)
+        return np.where(inside, self.group_of_cell[row, col], -1)
+
+    def shows(self, region: Region, cells: Bool[np.ndarray, "gh gw"]) -> bool:
+        """Whether any of the cells lie in the region (in its upright square)."""
+        half = region.size / 2
+        corners = np.array(region.center) + np.array([[-half, -half], [half, half]])
+        (top, bottom), (left, right), _ = self.grid.cells_of(corners)
+        return bool(cells[top : bottom + 1, left : right + 1].any())
+
+    def hide(self, crop: UInt8[np.ndarray, "n n 3"], region: Region, cells: Bool[np.ndarray, "gh gw"]) -> np.ndarray:
+        """The crop with the given cells greyed out, softly at their rim."""
+        size = crop.shape[0]
+        # crop pixels -> image pixels -> cells
+        to_image = np.vstack([region.to_image(size), (0, 0, 1)])
+        to_color = np.vstack([self.grid.to_color(), (0, 0, 1)])
+        alpha = cv2.warpAffine(
+            cells.astype(np.float32),
+            (np.linalg.inv(to_color) @ to_image)[:2],
+            (size, size),
+            flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+        )
+        if not alpha.any():
+            return crop
+        return (crop * (1 - alpha[..., None]) + _FILL * alpha[..., None]).astype(np.uint8)
+
+
+def windows(width: int, height: int, scene: Scene | None) -> list[Window]:
+    """Where to look in an image of width x height."""
+    if scene is None:
+        return [Window(r, None) for r in tiles(width, height, (1.0, 0.67))]
+    found = [Window(_around(g.box), i) for i, g in enumerate(scene.groups) if g.compact]
+    return found + [Window(r, None) for r in tiles(width, height, (1.0,))]
+
+
+def tiles(width: int, height: int, sides: tuple[float, ...]) -> list[Region]:
+    """The whole image, then overlapping squares with sides given in shorter image sides."""
+    out = [_around((-0.5, -0.5, width - 0.5, height - 0.5), 1.0)]
+    for share in sides:
+        side = share * min(width, height)
+        nx, ny = (max(1, int(np.ceil((n - side) / (0.55 * side) - 1e-6)) + 1) for n in (width, height))
+        if nx * ny == 1:
+            continue
+        for y in np.linspace(0, height - side, ny):
+            out += [_around((x, y, x + side, y + side), 1.0) for x in np.linspace(0, width - side, nx)]
+    return out
+
+
+def _around(box: tuple[float, float, float, float], margin: float = _MARGIN) -> Region:
+    left, top, right, bottom = box
+    return Region(((left + right) / 2, (top + bottom) / 2), margin * max(right - left, bottom - top), 0.0)
+
+
+def _merge(components: list[Component]) -> list[Group]:
+    """Groups compact components that stand above one another at about the same depth."""
+    parts: list[list[Component]] = [[c] for c in components if not c.is_compact()]
+    compact: list[list[Component]] = []
+    for c in sorted((c for c in components if c.is_compact()), key=lambda c: -c.area):
+        for group in compact:
+            if _stacked(group, c):
+                group.append(c)
+                break
+        else:
+            compact.append([c])
+    return [_group(p, True) for p in compact] + [_group(p, False) for p in parts]
+
+
+def _stacked(group: list[Component], c: Component) -> bool:
+    left, top, right, bottom = _union(group)
+    overlap = min(right, c.box[2]) - max(left, c.box[0])
+    gap = max(top, c.box[1]) - min(bottom, c.box[3])
+    pixels_per_metre = (c.box[3] - c.box[1]) / max(c.height, 0.05)
+    return (
+        abs(group[0].z - c.z) < 0.4
+        and overlap > 0.5 * min(right - left, c.box[2] - c.box[0])
+        and gap < 0.25 * pixels_per_metre
+        and (max(bottom, c.box[3]) - min(top, c.box[1])) < 2.3 * pixels_per_metre
+    )
+
+
+def _union(group: list[Component]) -> tuple[float, float, float, float]:
+    boxes = np.array([c.box for c in group])
+    left, top = boxes[:, :2].min(0).tolist()
+    right, bottom = boxes[:, 2:].max(0).tolist()
+    return left, top, right, bottom
+
+
+def _group(parts: list[Component], compact: bool) -> Group:
+    return Group(frozenset(c.label for c in parts), _union(parts), parts[0].z, compact)

@@ -1,0 +1,57 @@
+"""PAGE ONE: a frame in, people out. Every stage by name, in order."""
+
+from __future__ import annotations
+
+from understudy import detectors
+from understudy.detectors.base import Detector
+from understudy.errors import UnderstudyError, one_of
+from understudy.lifting import LIFTERS
+from understudy.registration import register
+from understudy.types import Frame, Keypoints2D, Person, RegisteredFrame
+
+METHODS = tuple(LIFTERS)
+"""Methods of lifting, by name."""
+
+
+class Estimator:
+    """Every person of an RGB-D frame: COCO-18 joints in metres, in the colour camera's frame.
+
+    1. `register`: depth into the colour camera's frame and pixels.
+    2. `detect`: 2D keypoints of everybody in the colour image.
+    3. `lift`: keypoints + depth -> 3D joints, by the chosen method. `naive` is one step; the voxel
+       network takes this place with its own: root, voxels, network, assembly.
+
+    Stateless: frames may come in any order. Identities over time are the business of `tracking`.
+    """
+
+    def __init__(self, method: str = "naive", detector: Detector | str = "blazepose", min_score: float = 0.2):
+        """method: one of METHODS. detector: an object, or a name that `detectors.create` knows.
+
+        min_score: 2D keypoints with a lower score are not lifted, in [0, 1].
+        """
+        if method not in LIFTERS:
+            raise UnderstudyError(f"method {method!r}: must be {one_of(METHODS)}")
+        if not 0 <= min_score <= 1:
+            raise UnderstudyError(f"min_score {min_score}: must be in [0, 1]")
+        self.method = method
+        self.min_score = min_score
+        self.detector = detectors.create(detector) if isinstance(detector, str) else detector
+        self._lifter = LIFTERS[method](min_score)
+
+    def estimate(self, frame: Frame | RegisteredFrame) -> list[Person]:
+        """People of one frame, as many as the detector finds; who cannot be lifted is listed with `failed`."""
+        registered = self.register(frame)
+        keypoints = self.detect(registered)
+        return self.lift(registered, keypoints)
+
+    def register(self, frame: Frame | RegisteredFrame) -> RegisteredFrame:
+        """Stage 1. A frame that is registered passes through."""
+        return frame if isinstance(frame, RegisteredFrame) else register(frame)
+
+    def detect(self, frame: RegisteredFrame) -> list[Keypoints2D]:
+        """Stage 2. People in the colour image."""
+        return self.detector.detect(frame.color, frame.depth, frame.index)
+
+    def lift(self, frame: RegisteredFrame, keypoints: list[Keypoints2D]) -> list[Person]:
+        """Stage 3. One Person for each entry of `keypoints`, numbered in that order."""
+        return [person.with_id(i) for i, person in enumerate(self._lifter.lift(frame, keypoints))]
