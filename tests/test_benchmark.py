@@ -1,5 +1,6 @@
 import csv
 import json
+import subprocess
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,12 +10,14 @@ import pytest
 
 from understudy import plots
 from understudy.benchmark import ALL, Timed, benchmark, precomputed
+from understudy.camera import Camera, RGBDCamera
 from understudy.errors import MissingExtraError, RecordingError, UnderstudyError
 from understudy.metrics import METRICS, metric_values
 from understudy.people_file import FramePeople, PeopleFile
+from understudy.recordings import write_recording
 from understudy.recordings.truth import Truth, TruthPerson
 from understudy.skeleton import JOINTS, N_JOINTS
-from understudy.types import INFERRED, MISSING, OBSERVED, Keypoints2D, Palm, Person
+from understudy.types import INFERRED, MISSING, OBSERVED, Frame, Keypoints2D, Palm, Person
 
 PNG = b"\x89PNG\r\n\x1a\n"
 METHODS = {"exact": 0.02, "coarse": 0.06, "naive": 0.04}
@@ -130,6 +133,23 @@ def test_results_json_says_what_it_means_and_where_it_ran(result_and_folder):
     assert len(row["pck_curves_percent"]["visible"]) == len(data["pck_thresholds_cm"]) == 201
     given = sum(round(j["joints"] * j["coverage_percent"] / 100) for j in row["joints"].values())
     assert sum(row["calibration_bins"]["joints"]) == given
+
+
+def test_recordings_by_path(tmp_path):
+    camera = RGBDCamera.aligned(Camera.from_fov(8, 6, 1.0))
+    frames = [Frame(np.zeros((6, 8, 3), np.uint8), np.ones((6, 8), np.float32), camera, i) for i in range(2)]
+    known = recording("known", 2)
+    write_recording(tmp_path / "known", frames, truth=known.truth)
+    write_recording(tmp_path / "blind", frames)
+    result = benchmark([tmp_path / "known"], ["exact"], None, lambda r, m: estimate(known, m))
+    assert result.rows[0].recording == "known" and result.rows[0].evaluation.joints["all"].n_truth == 2 * 2 * 18
+    with pytest.raises(RecordingError, match=r"blind/truth\.json: no such file"):
+        benchmark([str(tmp_path / "blind")], ["exact"], None, estimate)
+
+
+def test_neither_the_estimator_nor_matplotlib_is_needed_to_import_it():
+    code = "import sys, understudy.benchmark; assert not {'matplotlib', 'understudy.estimator'} & set(sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 def test_the_benchmark_times_what_is_not_timed_and_writes_nothing_unasked(tmp_path, monkeypatch):

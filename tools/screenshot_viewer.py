@@ -1,4 +1,4 @@
-"""Development tool: starts the viewer on a folder of results, takes pictures of the page, lists what the page asked for.
+"""Development tool: starts the viewer on a folder of results, takes pictures of the page, lists what it asked for.
 
     python tools/screenshot_viewer.py RESULTS OUT.png [--recording PATH] [--position N ...] [--size 1400x900] [--play S]
 
@@ -24,11 +24,21 @@ from websockets.sync.client import ClientConnection, connect
 
 from understudy.viewer import view
 
-CHROMIUM = (
-    "chromium --headless=new --no-sandbox --no-first-run --disable-quic --disable-background-networking "
-    "--disable-component-update --disable-sync --use-angle=swiftshader --enable-unsafe-swiftshader "
-    "--ignore-gpu-blocklist --hide-scrollbars --remote-debugging-port=0"
-).split()
+CHROMIUM = [
+    "chromium",
+    "--headless=new",
+    "--no-sandbox",
+    "--no-first-run",
+    "--disable-quic",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--ignore-gpu-blocklist",
+    "--hide-scrollbars",
+    "--remote-debugging-port=0",
+]
 
 
 class Page:

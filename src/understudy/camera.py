@@ -129,7 +129,8 @@ class Camera:
         num, den = P([1, k1, k2, k3]), P([1, k4, k5, k6])  # in s = r^2
         # d/dr [r num(s) / den(s)] = 0   <=>   num den + 2 s (num' den - num den') = 0
         slope = num * den + P([0, 2]) * (num.deriv() * den - num * den.deriv())
-        roots = np.concatenate([slope.trim().roots(), den.trim().roots()])
+        # Tiny leading coefficients put roots near infinity (r > 10) and overflow on the way there.
+        roots = np.concatenate([slope.trim(1e-12).roots(), den.trim(1e-12).roots()])
         real = roots[np.abs(roots.imag) < 1e-9].real
         real = real[real > 1e-12]
         return float(np.sqrt(real.min())) if len(real) else float("inf")
@@ -138,7 +139,8 @@ class Camera:
         """Undistorted normalized coordinates -> distorted ones; NaN beyond `max_radius`."""
         if not self.distorted:
             return xy
-        return np.stack(self.distort_xy(xy[..., 0], xy[..., 1]), axis=-1)
+        x, y = np.atleast_1d(xy[..., 0], xy[..., 1])  # a single point too
+        return np.stack(self.distort_xy(x, y), axis=-1).reshape(xy.shape)
 
     def distort_xy(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """`distort` on separate coordinates, in their own precision."""
@@ -159,7 +161,7 @@ class Camera:
         """Inverse of `distort`: damped Newton steps from a radial start; NaN where it has no solution within 1e-9."""
         if not self.distorted:
             return xy
-        target = np.asarray(xy, dtype=np.float64)
+        target = np.asarray(xy, dtype=np.float64).reshape(-1, 2)
         estimate = target * self._inverse_radial(np.linalg.norm(target, axis=-1))[..., None]
         residual = self.distort(estimate) - target
         for _ in range(iterations):
@@ -176,7 +178,7 @@ class Camera:
                 candidate = estimate - step
             keep = (np.abs(new).max(-1) <= np.abs(residual).max(-1))[..., None]
             estimate, residual = np.where(keep, candidate, estimate), np.where(keep, new, residual)
-        return np.where((np.abs(residual).max(-1) < 1e-9)[..., None], estimate, np.nan)
+        return np.where((np.abs(residual).max(-1) < 1e-9)[..., None], estimate, np.nan).reshape(xy.shape)
 
     def _inverse_radial(self, distorted_radius: np.ndarray) -> np.ndarray:
         """Undistorted over distorted radius from a table of the (monotone) radial part alone."""

@@ -16,6 +16,9 @@ Box = tuple[int, int, int, int]
 OUTLINE: Final = (20, 20, 20)
 WHITE: Final = (255, 255, 255)
 
+MIN_TEXT_SCALE: Final = 0.3
+"""of OpenCV's font: about 7 pixels high"""
+
 _SHIFT = 4  # OpenCV draws at 1/16 pixel
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 
@@ -27,7 +30,7 @@ class Canvas:
         assert image.flags.c_contiguous
         self.image = image
         self.height, self.width = image.shape[:2]
-        self._scale = max(0.3, min(self.height, self.width) / 1150)
+        self._scale = max(MIN_TEXT_SCALE, min(self.height, self.width) / 1150)
 
     # --- strokes ---
 
@@ -68,14 +71,19 @@ class Canvas:
     def label(self, text: str, above: tuple[float, float], color: Rgb, taken: Sequence[Box] = ()) -> Box | None:
         """Words in a dark box with a coloured edge, centred above a pixel; moved into the image, off the `taken` boxes.
 
-        Shrinks to the image's width. Returns the box; None where it could not be read (the image is too small).
+        Shrinks to the image's width, and is cut off where that is not enough. Returns the box; None where it could not
+        be read (the image is too small).
         """
         scale = self._scale
-        w, h = self._text_size(text, scale)
-        if w > self.width:
-            scale *= self.width / w
-            w, h = self.width, self._text_size(text, scale)[1]
-        if scale < 0.25 or h > self.height // 2:
+        while (w := self._text_size(text, scale)[0]) > self.width:
+            if scale > MIN_TEXT_SCALE:
+                scale = max(MIN_TEXT_SCALE, scale * self.width / w - 0.005)
+            elif len(text) > 8:
+                text = text[:-4].rstrip(".") + "..."
+            else:
+                return None
+        h = self._text_size(text, scale)[1]
+        if h > self.height // 2:
             return None
         left = int(np.clip(round(above[0] - w / 2), 0, self.width - w))
         top = int(np.clip(round(above[1] - h), 0, self.height - h))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from types import MappingProxyType
-from typing import Final, Protocol
+from typing import Final, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Float32
@@ -25,6 +25,7 @@ _SURFACE_TO_JOINT = np.array([_JOINT_DEPTH.get(name.split("_")[-1], 0.02) for na
 _SIGMA_2D = 0.004  # of a 2D keypoint, in image widths
 
 
+@runtime_checkable
 class Lifter(Protocol):
     """Lifts all people of one frame."""
 

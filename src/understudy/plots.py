@@ -124,7 +124,7 @@ def _bars(axes: Axes, heights: Mapping[str, list[float]], label_bars: bool = Fal
         x = np.arange(len(values)) + (i - (len(heights) - 1) / 2) * width
         bars = axes.bar(x, np.nan_to_num(values), width * 0.92, label=method, color=_style(i)["color"])
         if label_bars:
-            texts = ["-" if np.isnan(v) else f"{v:.0f}" for v in values]
+            texts = ["" if np.isnan(v) else f"{v:.0f}" for v in values]
             axes.bar_label(bars, texts, label_type="center", color="white", fontsize=9)
     axes.grid(axis="y", alpha=0.3)
     axes.set_axisbelow(True)

@@ -81,8 +81,10 @@ class DepthRegistration:
 
     def _without_hidden(self, nearest: np.ndarray) -> np.ndarray:
         """Zero where nothing was measured, and where what was measured lies behind the bridged surface."""
-        # erode then dilate distance = dilate then erode nearness
-        bridged = cv2.morphologyEx(nearest, cv2.MORPH_OPEN, self._bridge)
+        # Erode then dilate distance = dilate then erode nearness. Opposite anchors: with cv2.morphologyEx a bridge of
+        # even size would shift the surface by a pixel.
+        end = len(self._bridge) - 1
+        bridged = cv2.dilate(cv2.erode(nearest, self._bridge, anchor=(0, 0)), self._bridge, anchor=(end, end))
         limit = bridged * np.float32(1 + HIDDEN_MARGIN) + np.float32(0.02)
         nearest[(nearest > limit) | (nearest == _FAR)] = 0
         return nearest

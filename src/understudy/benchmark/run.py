@@ -130,10 +130,10 @@ def benchmark(
     if not methods or len(set(methods)) != len(methods):
         raise UnderstudyError(f"methods to compare: give at least one, each once; got {list(methods)}")
     cells: dict[tuple[str, str], _Cell] = {}
-    for name, recording in known.items():
+    for name, (recording, truth) in known.items():
         for method in methods:
             progress(f"{name}: {method}")
-            cells[name, method] = _run(recording, method, estimate, rule)
+            cells[name, method] = _run(recording, truth, method, estimate, rule)
     rows = [_row(name, method, [cell]) for (name, method), cell in cells.items()]
     if len(known) > 1:
         rows += [_row(ALL, method, [cells[name, method] for name in known]) for method in methods]
@@ -164,27 +164,30 @@ class _Cell:
     seconds: float | None
 
 
-def _with_truth(recordings: Sequence[RecordingWithTruth | Path | str]) -> dict[str, RecordingWithTruth]:
+def _with_truth(
+    recordings: Sequence[RecordingWithTruth | Path | str],
+) -> dict[str, tuple[RecordingWithTruth, Truth]]:
+    """Name -> recording and its truth, which is read once."""
     from understudy import recordings as formats  # readers are not needed when recordings are handed over
 
-    known: dict[str, RecordingWithTruth] = {}
+    known: dict[str, tuple[RecordingWithTruth, Truth]] = {}
     for given in recordings:
         recording = formats.open(given) if isinstance(given, (str, Path)) else given
-        if recording.truth is None:
+        truth = recording.truth
+        if truth is None:
             path = given if isinstance(given, (str, Path)) else getattr(given, "path", given.name)
             raise RecordingError(
                 f"{Path(path) / 'truth.json'}: no such file; a benchmark needs the truth to compare with"
             )
         if recording.name in {*known, ALL}:
             raise RecordingError(f"two recordings are named {recording.name!r}; their rows could not be told apart")
-        known[recording.name] = recording
+        known[recording.name] = recording, truth
     if not known:
         raise UnderstudyError("no recording to benchmark: give at least one")
     return known
 
 
-def _run(recording: RecordingWithTruth, method: str, estimate: Estimate, rule: MatchRule) -> _Cell:
-    assert recording.truth is not None
+def _run(recording: RecordingWithTruth, truth: Truth, method: str, estimate: Estimate, rule: MatchRule) -> _Cell:
     start = time.perf_counter()
     answer = estimate(recording, method)
     seconds: float | None = time.perf_counter() - start
@@ -192,7 +195,7 @@ def _run(recording: RecordingWithTruth, method: str, estimate: Estimate, rule: M
     frames = len(people.frames)
     if isinstance(answer, Timed):
         seconds = None if answer.ms_per_frame is None else answer.ms_per_frame * frames / 1000
-    return _Cell(observe(people.frames, recording.truth, rule), frames, seconds)
+    return _Cell(observe(people.frames, truth, rule), frames, seconds)
 
 
 def _row(recording: str, method: str, cells: Sequence[_Cell]) -> Row:

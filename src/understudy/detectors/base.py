@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import UInt8
@@ -10,6 +10,7 @@ from jaxtyping import UInt8
 from understudy.types import Keypoints2D, RegisteredDepth
 
 
+@runtime_checkable
 class Detector(Protocol):
     """Finds every person in a colour image. `tests/test_detectors.py` holds the contract that all back-ends pass."""
 

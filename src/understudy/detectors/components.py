@@ -54,8 +54,10 @@ class DepthGrid:
 
     def __init__(self, depth: RegisteredDepth, color: Camera):
         self.cell = int(np.ceil(depth.camera.width / GRID_WIDTH))
-        """depth pixels per cell"""
+        """depth pixels per cell; more where the depth is so sparse that cells would stay empty"""
         self.z = _cell_minima(depth.z, self.cell)
+        while _is_full_of_gaps(self.z) and self.z.shape[1] > GRID_WIDTH // 4:
+            self.z, self.cell = _cell_minima(self.z, 2), 2 * self.cell
         """nearest valid depth in each cell (metres), 0 = none"""
         self._scale = depth.scale_to(color)
         gh, gw = self.z.shape
@@ -115,7 +117,8 @@ class DepthGrid:
             mine = which == k
             (x0, x1), (y0, y1) = np.percentile(points[mine, :2], (1, 99), axis=0).T
             c, r = cols[mine], rows[mine]
-            (left, right), (top, bottom) = self.edges_to_color(c.min(), c.max()), self.edges_to_color(r.min(), r.max())
+            left, right = self.edges_to_color(int(c.min()), int(c.max()))
+            top, bottom = self.edges_to_color(int(r.min()), int(r.max()))
             found = Component(
                 int(names[k]),
                 (left, top, right, bottom),
@@ -157,6 +160,13 @@ def _cell_minima(z: np.ndarray, cell: int) -> np.ndarray:
     out = rows.reshape(len(rows), -1, cell).min(axis=2)
     out[out == far] = 0
     return out
+
+
+def _is_full_of_gaps(z: np.ndarray) -> bool:
+    """Whether many cells (one for every 6 with a value) are empty between two neighbours that are not."""
+    has = np.pad(z > 0, 1)
+    between = (has[1:-1, :-2] & has[1:-1, 2:]) | (has[:-2, 1:-1] & has[2:, 1:-1])
+    return bool(6 * (between & (z == 0)).sum() > (z > 0).sum())
 
 
 def fit_floor(points: Float32[np.ndarray, "n 3"], trials: int = 120) -> Float[np.ndarray, "4"] | None:

@@ -24,6 +24,9 @@ from understudy.recordings.pairing import pair_nearest
 UNIT_M = np.float32(0.001)
 """metres per depth value"""
 
+RATES_HZ = (5.0, 15.0, 30.0)
+"""what the camera can be set to"""
+
 _CODECS = {"COLOR": ("mjpeg", "rawvideo"), "DEPTH": ("rawvideo",)}
 
 
@@ -95,6 +98,7 @@ class _KinectFile:
         except BaseException:
             self._container.close()
             raise
+        self._second = round(1 / float(self._streams["COLOR"].time_base))  # in the units of pts
         self._demuxed: Iterator[Any] = iter(())
         self._position: int | None = None  # pts up to which packets are read; None: seek first
         self._early: dict[tuple[int, int], Any] = {}  # packets of later frames that came before their partners
@@ -156,21 +160,30 @@ class _KinectFile:
         """The packets of a colour and a depth image. Raises FrameError."""
         wanted = [(self._streams["COLOR"].index, color_pts), (self._streams["DEPTH"].index, depth_pts)]
         first, last = min(color_pts, depth_pts), max(color_pts, depth_pts)
+        reads_on = self._position is not None and self._position < first <= self._position + self._second
+        self._position = None  # until this frame is found
         with self._errors(FrameError, where):
-            if self._position is None or not self._position < first <= self._position + 1_000_000:
-                self._early.clear()
-                self._container.seek(first, stream=self._streams["DEPTH"], backward=True)
-                self._demuxed = self._container.demux(*self._streams.values())
-            self._position = None  # until this frame is found
-            self._early = {key: packet for key, packet in self._early.items() if key[1] >= first}
-            while not all(key in self._early for key in wanted):
-                packet = next(self._demuxed, None)
-                if packet is None or packet.pts is None or packet.pts > last + 2_000_000:
-                    raise FrameError(f"{where}: its images are not where they were when the file was opened")
-                if packet.pts >= first:
-                    self._early[packet.stream.index, packet.pts] = packet
-        self._position = first
-        return self._early[wanted[0]], self._early[wanted[1]]
+            # Seeking in one track may land behind the other's packet; seeking in the other then lands before both.
+            for track in ([None] if reads_on else []) + ["COLOR", "DEPTH"]:
+                if track is not None:
+                    self._early.clear()
+                    self._container.seek(first, stream=self._streams[track], backward=True)
+                    self._demuxed = self._container.demux(*self._streams.values())
+                if self._read_until(wanted, first, last + self._second):
+                    self._position = first
+                    return self._early[wanted[0]], self._early[wanted[1]]
+        raise FrameError(f"{where}: its images are not where they were when the file was opened")
+
+    def _read_until(self, wanted: list[tuple[int, int]], first: int, limit: int) -> bool:
+        """Reads packets into `_early`, those before `first` left out, until all the wanted ones are there."""
+        self._early = {key: packet for key, packet in self._early.items() if key[1] >= first}
+        while not all(key in self._early for key in wanted):
+            packet = next(self._demuxed, None)
+            if packet is None or packet.pts is None or packet.pts > limit:
+                return False
+            if packet.pts >= first:
+                self._early[packet.stream.index, packet.pts] = packet
+        return True
 
     def decode_color(self, packet: Any, where: str) -> UInt8[np.ndarray, "h w 3"]:
         """The packet's image, RGB. Raises FrameError."""
@@ -190,5 +203,9 @@ class _KinectFile:
 
 
 def _fps(times_s: np.ndarray) -> float | None:
-    """Frames per second (rounded to what the timer can tell) from ascending times; None for a single one."""
-    return round(1 / float(np.median(np.diff(times_s))), 3) if len(times_s) > 1 else None
+    """Frames per second from ascending times: the camera's setting where it is near one; None for a single image."""
+    if len(times_s) < 2:
+        return None
+    measured = 1 / float(np.median(np.diff(times_s)))
+    nearest = min(RATES_HZ, key=lambda rate: abs(rate - measured))
+    return nearest if abs(nearest - measured) < 0.1 * nearest else measured

@@ -4,7 +4,8 @@
     view("RESULTS")                     # a folder that `understudy estimate` wrote
 
     results.py  what is shown: people.json and the recording it was made from, frame by frame
-    cloud.py    coloured points from a registered frame; the floor under them
+    cloud.py    coloured points from a registered frame
+    floor.py    where up and the floor are
     scene.py    the 3D scene
     panel.py    the side panel
     app.py      view(): the server, playing, closing

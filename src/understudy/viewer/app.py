@@ -12,10 +12,9 @@ import time
 import webbrowser
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 from understudy.errors import MissingExtraError, UnderstudyError
-from understudy.types import Person
 from understudy.viewer.panel import Panel
 from understudy.viewer.results import Cache, Moment, Results
 from understudy.viewer.scene import Scene
@@ -79,8 +78,7 @@ class Viewer:
         self._fps = results.recording.fps or DEFAULT_FPS
         self._wanted, self._playing, self._closed = 0, False, False
         self._changed = threading.Condition()
-        self._drawing = threading.Lock()
-        self.scene = Scene(server, results.camera, self._first_people())
+        self.scene = Scene(server, results.camera, self._cache.get(self._first_with_people()))
         self.panel = Panel(
             server.gui,
             self,
@@ -89,7 +87,7 @@ class Viewer:
             fps=min(max(self._fps, 1.0), 30.0),
             point_size_m=self.scene.point_size_m,
         )
-        self.show(0)
+        self._draw(0)
         self._thread = threading.Thread(target=self._run, name="understudy-viewer", daemon=True)
         self._thread.start()
 
@@ -111,7 +109,7 @@ class Viewer:
         """Shows a position soon. A newer wish replaces an older one."""
         with self._changed:
             self._wanted = min(max(position, 0), len(self) - 1)
-            self._changed.notify()
+            self._changed.notify_all()
 
     def step(self, by: int) -> None:
         self.go_to((self._wanted + by) % len(self))
@@ -119,7 +117,7 @@ class Viewer:
     def toggle_playing(self) -> None:
         with self._changed:
             self._playing = not self._playing and len(self) > 1
-            self._changed.notify()
+            self._changed.notify_all()
         self.panel.playing(self._playing)
 
     def set_fps(self, fps: float) -> None:
@@ -137,15 +135,22 @@ class Viewer:
     # --- drawing ---
 
     def show(self, position: int) -> None:
-        """Draws a position; returns when it is sent to the browsers."""
+        """`go_to` that returns when the frame is on its way to the browsers (or another was wished for)."""
+        self.go_to(position)
+        with self._changed:
+            self._changed.wait_for(lambda: self._closed or self.position == position or self._wanted != position)
+
+    def _draw(self, position: int) -> None:
         moment = self._cache.get(position)
-        with self._drawing, self.server.atomic():
+        with self.server.atomic():
             self.scene.draw(moment)
             self.panel.show(moment, position)
             if self._wanted == position and self.panel.slider.value != position + 1:
                 self.panel.slider.value = position + 1
-            self.position, self.moment = position, moment
         self.server.flush()
+        with self._changed:
+            self.position, self.moment = position, moment
+            self._changed.notify_all()
 
     def _run(self) -> None:
         due = 0.0
@@ -161,14 +166,15 @@ class Viewer:
                     return
                 target, playing = self._wanted, self._playing
             due = time.monotonic() + 1 / self._fps
-            self.show(target)
+            self._draw(target)
             if playing:
                 for ahead in range(1, AHEAD + 1):
                     self._cache.prefetch((target + ahead) % len(self))
 
-    def _first_people(self) -> tuple[Person, ...]:
-        """Those of the first frame that has people with 3D joints."""
-        return next((m.lifted for m in map(Moment, self.results.people.frames) if m.lifted), ())
+    def _first_with_people(self) -> int:
+        """Position of the first frame that has people with 3D joints; 0 if none has."""
+        frames = self.results.people.frames
+        return next((i for i, f in enumerate(frames) if Moment(f).lifted), 0)
 
     # --- life ---
 
@@ -188,14 +194,14 @@ class Viewer:
             if self._closed:
                 return
             self._closed = True
-            self._changed.notify()
+            self._changed.notify_all()
         self._thread.join(timeout=10)
         self._cache.close()
         with contextlib.redirect_stdout(io.StringIO()):
             self.server.stop()
         self.results.recording.close()
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> Viewer:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:

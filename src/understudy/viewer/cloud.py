@@ -1,4 +1,4 @@
-"""Coloured points from a registered frame, and the floor under them."""
+"""Coloured points from a registered frame."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from functools import lru_cache
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Float32, UInt8
+from jaxtyping import Bool, Float32, UInt8
 from scipy.spatial import cKDTree
 
 from understudy.camera import Camera
@@ -31,12 +31,11 @@ class Cloud:
     """metres"""
     colors: UInt8[np.ndarray, "n 3"]
     """RGB"""
+    spacing_m: float
+    """distance between neighbours on a surface"""
 
     def __len__(self) -> int:
         return len(self.points)
-
-    def where(self, chosen: Bool[np.ndarray, "_n"]) -> Cloud:
-        return Cloud(self.points[chosen], self.colors[chosen])
 
 
 def make_cloud(frame: RegisteredFrame, max_points: int = MAX_POINTS) -> Cloud:
@@ -48,12 +47,12 @@ def make_cloud(frame: RegisteredFrame, max_points: int = MAX_POINTS) -> Cloud:
     points = _rays(depth.camera)[v, u] * depth.z[v, u][:, None]
     known = np.isfinite(points).all(axis=1)
     points, u, v = points[known], u[known], v[known]
-    chosen = thin(points, max_points)
+    chosen, spacing = thin(points, max_points)
     scale = depth.scale_to(frame.camera)
     height, width = frame.color.shape[:2]
     cu = np.clip(np.rint((u[chosen] + 0.5) / scale - 0.5).astype(int), 0, width - 1)
     cv = np.clip(np.rint((v[chosen] + 0.5) / scale - 0.5).astype(int), 0, height - 1)
-    return Cloud(points[chosen], frame.color[cv, cu])
+    return Cloud(points[chosen], frame.color[cv, cu], spacing)
 
 
 @lru_cache(maxsize=4)
@@ -64,19 +63,24 @@ def _rays(camera: Camera) -> Float32[np.ndarray, "h w 3"]:
     return np.concatenate([xy, np.ones_like(xy[..., :1])], axis=-1).astype(np.float32)
 
 
-def thin(points: Float32[np.ndarray, "_n 3"], max_points: int | None = None, cell: float = FINEST_M) -> np.ndarray:
-    """Rows of the first point in each cell of a grid: `cell` metres wide, or as much wider as `max_points` asks."""
+def thin(
+    points: Float32[np.ndarray, "n 3"], max_points: int | None = None, cell: float = FINEST_M
+) -> tuple[np.ndarray, float]:
+    """Rows of the first point in each cell of a grid, and how wide its cells are.
+
+    They are `cell` metres wide, or as much wider as `max_points` asks.
+    """
     while True:
         cells = np.floor(points / cell).astype(np.int64)
         cells -= cells.min(axis=0, initial=0)
         key = (cells[:, 0] << 42) + (cells[:, 1] << 21) + cells[:, 2]
         rows = np.unique(key, return_index=True)[1]
         if max_points is None or len(rows) <= max_points:
-            return rows
+            return rows, cell
         cell *= max(1.1, (len(rows) / max_points) ** 0.5)  # surfaces: points go with the square of the cell
 
 
-def near_people(points: Float32[np.ndarray, "n 3"], people: Sequence[Person]) -> Bool[np.ndarray, "_n"]:
+def near_people(points: Float32[np.ndarray, "n 3"], people: Sequence[Person]) -> Bool[np.ndarray, " n"]:
     """Which points belong to people: within `NEAR_PERSON_M` of their bodies."""
     centres = []
     for person in people:
@@ -95,14 +99,3 @@ def smaller(image: UInt8[np.ndarray, "h w 3"], max_width: int) -> UInt8[np.ndarr
     if w <= max_width:
         return image
     return cv2.resize(image, (max_width, max(1, round(h * max_width / w))), interpolation=cv2.INTER_AREA)
-
-
-def up_and_floor(people: Sequence[Person]) -> tuple[Float[np.ndarray, "3"], float]:
-    """Up (against the camera's y) and how far the floor is from the camera along it (metres, negative: below).
-
-    The floor lies just under the lowest ankles; 1.5 m under the camera where nobody has any.
-    """
-    joints = np.concatenate([p.keypoints for p in people]) if people else np.zeros((0, 3))
-    lowest = joints[np.isfinite(joints).all(axis=1), 1]
-    floor = float(np.percentile(lowest, 98)) + 0.08 if len(lowest) else 1.5
-    return np.array([0.0, -1.0, 0.0]), -floor

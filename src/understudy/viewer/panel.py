@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Callable
 from functools import partial
 from html import escape
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import UInt8
@@ -17,6 +17,7 @@ from understudy.viewer.results import Moment
 from understudy.viewer.scene import GROUPS
 
 
+@runtime_checkable
 class Controls(Protocol):
     """What the panel asks of the viewer."""
 
@@ -71,6 +72,18 @@ class Panel:
             self._image.visible = box.value
         else:
             controls.set_visible(group, box.value)
+
+    @property
+    def image(self) -> UInt8[np.ndarray, "h w 3"]:
+        return np.asarray(self._image.image)
+
+    @property
+    def status(self) -> str:
+        return str(self._status.content)
+
+    @property
+    def people(self) -> str:
+        return str(self._people.content)
 
     def playing(self, playing: bool) -> None:
         self._play.label = "Pause" if playing else "Play"

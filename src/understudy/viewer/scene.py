@@ -11,15 +11,17 @@ from understudy.camera import Camera
 from understudy.overlay import PALM_ARROW_M, Rgb, bone_color, describe, joint_color, person_color
 from understudy.skeleton import BONES, FACE, JOINT
 from understudy.types import INFERRED, Person
-from understudy.viewer.cloud import Cloud, near_people, thin, up_and_floor
+from understudy.viewer.cloud import Cloud, near_people, thin
+from understudy.viewer.floor import find_floor
 from understudy.viewer.results import Moment
 
 JOINT_RADIUS_M = 0.028
 FACE_RADIUS_M = 0.016
 BONE_WIDTH_M = 0.025
 FOV = float(np.deg2rad(45))
-FROM = np.array([0.5, -0.42, -0.75])
-"""direction of the first view's place from the people"""
+RIGHT = np.array([1.0, 0.0, 0.0])
+FROM = np.array([0.5, 0.42, 0.75])
+"""direction of the first view's place from the people: to the right, up, towards the camera"""
 SEE_THROUGH_M = 0.014
 """distance of the points of people when they are to be seen through"""
 PEOPLE_SIZE = 0.6
@@ -38,21 +40,25 @@ def pale(color: Rgb) -> Rgb:
 class Scene:
     """Draws moments on a viser server; nodes of the same name replace each other."""
 
-    def __init__(self, server: Any, camera: Camera, people: tuple[Person, ...]):
+    def __init__(self, server: Any, camera: Camera, first: Moment):
+        """`first` decides the view: the first frame with people."""
         self._api = server.scene
         self._camera = camera
         self._sphere = _icosahedron()
-        self._groups = {name: self._api.add_frame(f"/{name}", show_axes=False) for name in GROUPS}
-        self._nodes: dict[str, Any] = {}
+        self.groups = {name: self._api.add_frame(f"/{name}", show_axes=False) for name in GROUPS}
+        self.nodes: dict[str, Any] = {}
+        """viser's handles of what changes with the frame, by name"""
         self._clouds: dict[str, Any] = {}
         self._see_through = True
-        self.point_size_m = 0.008
-        self._set_up(server, people)
+        spacing = first.cloud.spacing_m if first.cloud is not None else 0.0
+        self.point_size_m = float(np.clip(round(0.45 * spacing, 3), 0.007, 0.02))
+        self._set_up(server, first)
 
-    def _set_up(self, server: Any, people: tuple[Person, ...]) -> None:
-        """Up, floor, and a first view from above and aside on all the given people."""
-        up, height = up_and_floor(people)
-        self._api.set_up_direction(tuple(up))
+    def _set_up(self, server: Any, first: Moment) -> None:
+        """Up, floor, and a first view from above and aside on all the people."""
+        people = first.lifted
+        floor = find_floor(first.cloud.points if first.cloud is not None else None, people)
+        self._api.set_up_direction(tuple(floor.up))
         joints = np.concatenate([p.keypoints for p in people]) if people else np.array([[0.0, 0.0, 2.5]])
         joints = joints[np.isfinite(joints).all(axis=1)]
         centre = (joints.min(axis=0) + joints.max(axis=0)) / 2
@@ -63,17 +69,18 @@ class Scene:
             plane="xz",
             cell_size=0.5,
             section_size=1.0,
-            position=tuple(centre + up * (height - centre @ up)),
+            wxyz=tuple(floor.wxyz()),
+            position=tuple(floor.below(centre)),
             shadow_opacity=0.0,
         )
         view = server.initial_camera
-        view.position = tuple(view_point(joints, centre, up))
+        view.position = tuple(view_point(joints, centre, floor.up))
         view.look_at = tuple(centre)
         view.fov = FOV
 
     def visible(self, group: str, shown: bool) -> None:
         """Shows or hides one of `GROUPS`."""
-        self._groups[group].visible = shown
+        self.groups[group].visible = shown
 
     def set_point_size(self, metres: float) -> None:
         self.point_size_m = metres
@@ -88,20 +95,20 @@ class Scene:
 
     def draw(self, moment: Moment) -> None:
         """Replaces what is shown. Call within `server.atomic()`."""
-        before, self._nodes, self._clouds = self._nodes, {}, {}
+        before, self.nodes, self._clouds = self.nodes, {}, {}
         if moment.cloud is not None:
             self._draw_cloud(moment.cloud, moment.lifted)
         for number, person in enumerate(moment.lifted):  # not the id: nothing makes ids differ within a frame
             self._draw_person(person, number)
         self._draw_camera(moment)
-        for name in before.keys() - self._nodes.keys():
+        for name in before.keys() - self.nodes.keys():
             before[name].remove()
 
     def _draw_cloud(self, cloud: Cloud, people: tuple[Person, ...]) -> None:
         """People in two parts: few small points, through which their skeletons show, and the others."""
         theirs = near_people(cloud.points, people)
         sparse = np.zeros(len(cloud), dtype=bool)
-        sparse[np.flatnonzero(theirs)[thin(cloud.points[theirs], cell=SEE_THROUGH_M)]] = True
+        sparse[np.flatnonzero(theirs)[thin(cloud.points[theirs], cell=SEE_THROUGH_M)[0]]] = True
         for name, chosen in (("room", ~theirs), ("people", sparse), ("people_dense", theirs & ~sparse)):
             if chosen.any():
                 node = self._api.add_point_cloud(
@@ -175,15 +182,16 @@ class Scene:
         )
 
     def _keep(self, node: Any) -> Any:
-        self._nodes[node.name] = node
+        self.nodes[node.name] = node
         return node
 
 
 def view_point(
-    points: Float[np.ndarray, "_n 3"], centre: Float[np.ndarray, "3"], up: Float[np.ndarray, "3"]
+    points: Float[np.ndarray, "n 3"], centre: Float[np.ndarray, "3"], up: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "3"]:
     """Where to stand to see all points when looking at the centre from `FROM`: as near as they fit, with a margin."""
-    back = FROM / np.linalg.norm(FROM)
+    back = FROM[0] * RIGHT + FROM[1] * up + FROM[2] * np.cross(RIGHT, up)
+    back /= np.linalg.norm(back)
     right = np.cross(up, back)
     right /= np.linalg.norm(right)
     off = points - centre

@@ -1,0 +1,76 @@
+"""Where up is and where the floor is, so that the scene stands upright although the camera may look down."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Float32
+
+from understudy.types import Person
+
+CAMERA_UP = np.array([0.0, -1.0, 0.0])
+MAX_TILT = np.deg2rad(50)
+"""between the camera's and the floor's up, radians"""
+THICKNESS_M = 0.025
+MIN_SHARE = 0.06
+"""of the points, on the floor"""
+MAX_BELOW = 0.03
+"""share of the points, under the floor: else it is a table"""
+
+_SAMPLES, _TRIES = 4000, 400
+
+
+@dataclass(frozen=True, eq=False)
+class Floor:
+    """The plane {p : up @ p = height} in the colour camera's frame."""
+
+    up: Float[np.ndarray, "3"]
+    """unit vector"""
+    height: float
+    """metres; negative when the floor is under the camera"""
+
+    def below(self, point: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+        """The floor's point under (or over) a point."""
+        return point + self.up * (self.height - self.up @ point)
+
+    def wxyz(self) -> Float[np.ndarray, "4"]:
+        """The smallest rotation that takes the camera's up to the floor's, as a quaternion."""
+        q = np.concatenate([[1 + CAMERA_UP @ self.up], np.cross(CAMERA_UP, self.up)])
+        return q / np.linalg.norm(q)
+
+
+def find_floor(points: Float32[np.ndarray, "n 3"] | None, people: Sequence[Person]) -> Floor:
+    """The floor among measured points; without one, level with the camera and under the people's lowest joints."""
+    return (None if points is None else _fit(points.astype(np.float64))) or _under(people)
+
+
+def _under(people: Sequence[Person]) -> Floor:
+    joints = np.concatenate([p.keypoints for p in people]) if people else np.zeros((0, 3))
+    lowest = joints[np.isfinite(joints).all(axis=1), 1]
+    return Floor(CAMERA_UP, -(float(lowest.max()) + 0.08) if len(lowest) else -1.5)
+
+
+def _fit(points: Float[np.ndarray, "n 3"]) -> Floor | None:
+    """The plane through most points that nearly all others are above (random triples, then least squares)."""
+    if len(points) < 200:
+        return None
+    random = np.random.default_rng(0)
+    points = points[random.permutation(len(points))[:_SAMPLES]]
+    a, b, c = points[random.integers(len(points), size=(3, _TRIES))]
+    normals = np.cross(b - a, c - a)
+    length = np.linalg.norm(normals, axis=1)
+    upright = np.abs(normals @ CAMERA_UP) > np.cos(MAX_TILT) * np.maximum(length, 1e-9)
+    normals = normals[upright] / length[upright, None]
+    normals *= np.sign(normals @ CAMERA_UP)[:, None]
+    over = points @ normals.T - np.sum(a[upright] * normals, axis=1)  # points x planes, metres
+    on = (np.abs(over) < THICKNESS_M).mean(axis=0)
+    on[(over < -4 * THICKNESS_M).mean(axis=0) > MAX_BELOW] = 0
+    if not len(on) or on.max() < MIN_SHARE:
+        return None
+    best = points[np.abs(over[:, np.argmax(on)]) < THICKNESS_M]
+    centre = best.mean(axis=0)
+    up = np.linalg.svd(best - centre, full_matrices=False)[2][2]
+    up *= np.sign(up @ CAMERA_UP) or 1.0
+    return Floor(up, float(up @ centre))

@@ -1,0 +1,30 @@
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from understudy.geometry import angle_between, inverse, is_rigid, rigid, transform_points
+
+vectors = st.tuples(*[st.floats(-3, 3)] * 3).map(np.array)
+
+
+@given(vectors, vectors, vectors)
+def test_inverse_undoes(rotvec, t, p):
+    T = rigid(Rotation.from_rotvec(rotvec).as_matrix(), t)
+    assert is_rigid(T)
+    np.testing.assert_allclose(transform_points(inverse(T), transform_points(T, p[None])), p[None], atol=1e-12)
+    np.testing.assert_allclose(inverse(T) @ T, np.eye(4), atol=1e-12)
+
+
+def test_mirrors_and_scales_are_not_rigid():
+    assert not is_rigid(np.diag([-1.0, 1, 1, 1]))
+    assert not is_rigid(np.diag([1.01, 1, 1, 1]))
+    assert not is_rigid(np.full((4, 4), np.nan))
+
+
+@given(vectors, st.floats(0, np.pi))
+def test_angle_is_the_rotation_between(axis, angle):
+    axis = axis + (0, 0, 4.0)
+    across = np.cross(axis, (1.0, 0.3, 0))
+    turned = Rotation.from_rotvec(angle * axis / np.linalg.norm(axis)).apply(across)
+    np.testing.assert_allclose(angle_between(across, turned), angle, atol=1e-7)
