@@ -138,6 +138,7 @@ def test_behind_or_in_the_lens_has_no_projection():
         uv = camera.project(points)
         assert np.isnan(uv[:3]).all() and np.isnan(uv[3]).any()
         np.testing.assert_allclose(uv[4], [320, 240])
+        assert not camera.contains(camera.project(np.array([[1.0, 1.0, 1e-300]]))).any()  # and no warning
 
 
 def test_beyond_the_fold_there_is_nothing():

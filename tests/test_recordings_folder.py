@@ -367,6 +367,7 @@ FRAME = {
     "color size": ("color/000001.png", png(noise(17, 24, 3)), "24 x 17 pixels, but recording.json: color says 24 x 18"),
     "color not an image": ("color/000001.png", b"hello", "neither a PNG nor a JPEG"),
     "color jpeg cut": ("color/000001.png", COLOR_JPG[:-30], "truncated JPEG"),
+    "color jpeg damaged": ("color/000001.png", COLOR_JPG[:-90] + b"\xff\xd8" + COLOR_JPG[-88:], "damaged JPEG"),
     "color jpeg headers": ("color/000001.png", COLOR_JPG[:60], "truncated JPEG"),
     "color pixels missing": ("color/000001.png", SHORT_PNG, "color/000001.png: the image cannot be decoded"),
 }

@@ -93,7 +93,7 @@ class Camera:
     def project(self, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 2"]:
         """Points (metres, camera frame) -> pixels (u, v). NaN where z <= 0 or beyond the lens model's range."""
         z = points[..., 2]
-        with np.errstate(divide="ignore", invalid="ignore"):
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # z may be tiny
             xy = np.where((z > 0)[..., None], points[..., :2] / z[..., None], np.nan)
             return self.distort(xy) * (self.fx, self.fy) + (self.cx, self.cy)
 

@@ -59,7 +59,7 @@ class BlazePoseDetector:
             for candidate, three in zip(candidates, looks, strict=True)
             if max(look.score for look in three) >= self.min_score
         ]
-        return merge_duplicates(people)
+        return merge_duplicates([p for p in people if scene is None or _life_size(p, scene)])
 
     @staticmethod
     def _scene(color: np.ndarray, depth: RegisteredDepth | None) -> Scene | None:
@@ -146,6 +146,14 @@ def _torso_length(rows: np.ndarray) -> float:
     return float(np.linalg.norm(rows[_SHOULDERS, :2].mean(0) - rows[_HIPS, :2].mean(0)))
 
 
+def _life_size(person: Keypoints2D, scene: Scene) -> bool:
+    """Whether the torso's length could be a person's, however turned or bent. True where its depth is not known."""
+    if person.torso_z is None:
+        return True
+    metres = _torso_length(person.uv) * person.torso_z / (scene.grid.camera.fx * scene.grid.color_pixels)
+    return 0.08 < metres < 1.1
+
+
 def _agreement(apart: np.ndarray, least: float) -> np.ndarray:
     """1 for looks within 8 % of a torso length of each other, falling to `least` when they are far apart."""
     return least + (1 - least) * np.exp(-((np.maximum(apart - 0.08, 0) / 0.25) ** 2))
@@ -191,7 +199,7 @@ def _places(scene: Scene, group: int, torso_z: float | None, uv: Float[np.ndarra
     cols = (col[:, None] + offsets[:, 1]).clip(0, grid.z.shape[1] - 1)
     z, groups = grid.z[rows, cols], scene.group_of_cell[rows, cols]
     near = (z > 0) & (np.abs(z - torso_z) < 0.9)
-    on = ((groups == group) if group >= 0 else near).any(1)
+    on = (near & (groups == group) if group >= 0 else near).any(1)
     on |= near.any(1) & ~(groups >= 0).any(1)  # small parts cut off, and feet that merge with the floor
     unmeasured = (z == 0).all(1)
     nearer = ((z > 0) & (z < torso_z - 0.25)).any(1)

@@ -131,14 +131,18 @@ class DepthGrid:
                 out.append(found)
         return sorted(out, key=lambda c: c.z)
 
+    @property
+    def color_pixels(self) -> float:
+        """Colour pixels per cell."""
+        return self.cell / self._scale
+
     def edges_to_color(self, first: int, last: int) -> tuple[float, float]:
         """Outer edges of a run of cells -> colour pixels (one axis)."""
-        k = self.cell / self._scale
-        return first * k - 0.5, (last + 1) * k - 0.5
+        return first * self.color_pixels - 0.5, (last + 1) * self.color_pixels - 0.5
 
     def cells_of(self, uv: Float[np.ndarray, "n 2"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Colour pixels -> (row, column) of their cells, clipped, and whether they are inside."""
-        cell = np.floor((np.nan_to_num(uv, nan=-1.0) + 0.5) * (self._scale / self.cell)).astype(np.int64)
+        cell = np.floor((np.nan_to_num(uv, nan=-1.0) + 0.5) / self.color_pixels).astype(np.int64)
         limit = np.array(self.z.shape[::-1]) - 1
         inside = ((cell >= 0) & (cell <= limit)).all(1)
         clipped = cell.clip(0, limit)
@@ -146,7 +150,7 @@ class DepthGrid:
 
     def to_color(self) -> Float[np.ndarray, "2 3"]:
         """Affine map from cell indices (column, row) to colour pixels."""
-        k = self.cell / self._scale
+        k = self.color_pixels
         return np.array([[k, 0, 0.5 * k - 0.5], [0, k, 0.5 * k - 0.5]])
 
 

@@ -1,7 +1,8 @@
 """Where to look for people, and what to hide while looking.
 
-With depth: a window around each thing that could be a person, other such things greyed out of it; and a few large tiles
-for people that depth does not show or does not separate from the furniture. Without depth: tiles of three sizes.
+With depth: a window around each thing that could be a person, other such things greyed out of it; large tiles for
+people whom depth does not show; and, where things are joined to walls and furniture, tiles of about a person's size.
+Without depth: tiles of three sizes.
 """
 
 from __future__ import annotations
@@ -18,6 +19,8 @@ from understudy.detectors.components import Component, DepthGrid
 from understudy.types import RegisteredDepth
 
 _MARGIN = 1.25  # window side over the larger side of the thing
+MAX_JOINED = 10
+"""tiles on walls and furniture"""
 _FILL = 128  # grey level of what is hidden
 
 
@@ -94,20 +97,41 @@ def windows(width: int, height: int, scene: Scene | None) -> list[Window]:
     if scene is None:
         return [Window(r, None) for r in tiles(width, height, (1.0, 0.67))]
     found = [Window(_around(g.box), i) for i, g in enumerate(scene.groups) if g.compact]
-    return found + [Window(r, None) for r in tiles(width, height, (1.0,))]
+    return found + [Window(r, None) for r in tiles(width, height, (1.0,)) + _joined(width, height, scene)]
+
+
+def _joined(width: int, height: int, scene: Scene) -> list[Region]:
+    """Tiles of 2.6 m where things are too large to be one person; none where the large tiles are not much larger."""
+    large = [i for i, g in enumerate(scene.groups) if not g.compact]
+    row, col = np.nonzero(np.isin(scene.group_of_cell, large) & (scene.grid.z > 0))
+    if not len(row):
+        return []
+    pixels_per_metre = scene.grid.camera.fx / float(np.median(scene.grid.z[row, col])) * scene.grid.color_pixels
+    side = max(2.6 * pixels_per_metre, 0.35 * min(width, height))
+    if side > 0.75 * min(width, height):
+        return []
+    (left, right), (top, bottom) = (scene.grid.edges_to_color(int(a.min()), int(a.max())) for a in (col, row))
+    squares = _cover(left, top, right, bottom, side)
+    return squares[:: -(-len(squares) // MAX_JOINED)]
 
 
 def tiles(width: int, height: int, sides: tuple[float, ...]) -> list[Region]:
     """The whole image, then overlapping squares with sides given in shorter image sides."""
     out = [_around((-0.5, -0.5, width - 0.5, height - 0.5), 1.0)]
     for share in sides:
-        side = share * min(width, height)
-        nx, ny = (max(1, int(np.ceil((n - side) / (0.55 * side) - 1e-6)) + 1) for n in (width, height))
-        if nx * ny == 1:
-            continue
-        for y in np.linspace(0, height - side, ny):
-            out += [_around((x, y, x + side, y + side), 1.0) for x in np.linspace(0, width - side, nx)]
+        squares = _cover(-0.5, -0.5, width - 0.5, height - 0.5, share * min(width, height))
+        out += squares if len(squares) > 1 else []
     return out
+
+
+def _cover(left: float, top: float, right: float, bottom: float, side: float) -> list[Region]:
+    """Squares that cover a box, overlapping by half or more; they reach beyond a box that is smaller than they are."""
+    spans = []
+    for low, high in ((left, right), (top, bottom)):
+        room = high - low - side
+        n = max(1, int(np.ceil(room / (0.45 * side) - 1e-6)) + 1)
+        spans.append(np.linspace(low, high - side, n) if room > 0 else np.array([(low + high - side) / 2]))
+    return [_around((x, y, x + side, y + side), 1.0) for y in spans[1] for x in spans[0]]
 
 
 def _around(box: tuple[float, float, float, float], margin: float = _MARGIN) -> Region:
