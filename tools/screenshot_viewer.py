@@ -1,9 +1,11 @@
 """Development tool: starts the viewer on a folder of results, takes pictures of the page, lists what it asked for.
 
-    python tools/screenshot_viewer.py RESULTS OUT.png [--recording PATH] [--position N ...] [--size 1400x900] [--play S]
+    python tools/screenshot_viewer.py RESULTS OUT.png [--recording PATH] [--position N ...] [--size 1400x900]
+    python tools/screenshot_viewer.py RESULTS OUT.png --press Next Play Cloud
 
 Needs the extra 'viewer' and Chromium (Debian: apt-get install chromium); draws WebGL in software, no display needed.
-With several positions the pictures are OUT_0.png, OUT_1.png, ... `--play S` presses Play and waits S seconds instead.
+With several positions the pictures are OUT_0.png, OUT_1.png, ... `--press` presses those buttons (or check boxes) of
+the page, waits two seconds after each, and takes one picture at the end.
 Exits with 1 if the page asked any host but this computer for anything, or reported an error.
 """
 
@@ -71,6 +73,20 @@ class Page:
             except TimeoutError:
                 return
 
+    def press(self, word: str) -> None:
+        """Clicks the button with a word on it, or the check box in the row of that word."""
+        script = f"""(() => {{
+            const own = e => e.textContent.trim() === {json.dumps(word)};
+            const button = [...document.querySelectorAll("button, [role=button]")].find(own);
+            if (button) return button.click(), true;
+            let row = [...document.querySelectorAll("label, div, p")].filter(own).pop();
+            while (row && !row.querySelector("input[type=checkbox]")) row = row.parentElement;
+            if (row) row.querySelector("input[type=checkbox]").click();
+            return Boolean(row);
+        }})()"""
+        if not self.call("Runtime.evaluate", expression=script, returnByValue=True)["result"].get("value"):
+            raise RuntimeError(f"the page has nothing to press with the word {word!r}")
+
     def picture(self, path: Path) -> None:
         path.write_bytes(base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"]))
         print(path)
@@ -111,7 +127,7 @@ def main() -> int:
     parser.add_argument("--position", type=int, nargs="+", default=[0])
     parser.add_argument("--size", default="1400x900")
     parser.add_argument("--wait", type=float, default=8.0, help="seconds for the page to draw")
-    parser.add_argument("--play", type=float, help="seconds of playing before the picture")
+    parser.add_argument("--press", nargs="+", default=[], help="words on buttons or check boxes of the page")
     args = parser.parse_args()
     with (
         tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder,
@@ -128,11 +144,12 @@ def main() -> int:
                 page.call("Emulation.setDeviceMetricsOverride", **metrics)
                 page.call("Page.navigate", url=viewer.url)
                 page.wait(args.wait)
-                if args.play is not None:
-                    viewer.toggle_playing()
-                    page.wait(args.play)
+                if args.press:
+                    for word in args.press:
+                        page.press(word)
+                        page.wait(2.0)
+                        print(f"pressed {word}: position {viewer.position} is shown")
                     page.picture(args.out)
-                    print(f"shown: position {viewer.position}")
                 else:
                     for position in args.position:
                         viewer.show(position)

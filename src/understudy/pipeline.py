@@ -115,7 +115,7 @@ class _Run:
 
     def _people(self, frame: Frame) -> list[Person]:
         registered = self.estimator.register(frame)
-        people = self._tracker.update(self.estimator.estimate(registered))
+        people = sorted(self._tracker.update(self.estimator.estimate(registered)), key=lambda person: person.id)
         if self.overlays:
             write_png(self.out / OVERLAYS / f"{frame.index:06d}.png", draw_frame(registered, people))
         return people

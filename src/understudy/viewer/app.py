@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import ipaddress
+import logging
 import os
 import socket
 import threading
@@ -47,6 +48,16 @@ def view(
     except BaseException:
         opened.recording.close()
         raise
+    _announce(viewer, host, port, block)
+    if open_browser:
+        webbrowser.open(viewer.url)
+    if block:
+        viewer.wait()
+    return viewer
+
+
+def _announce(viewer: Viewer, host: str, port: int, block: bool) -> None:
+    """Prints where the page is, and what is to be known about that."""
     if port not in (0, viewer.port):
         print(f"Port {port} is taken; using {viewer.port}.")
     if not is_local(host):
@@ -55,11 +66,6 @@ def view(
             "the recording. There is no password and no encryption. Leave --host out to keep it to this computer."
         )
     print(f"Viewer: {viewer.url} (Ctrl-C ends it)" if block else f"Viewer: {viewer.url}", flush=True)
-    if open_browser:
-        webbrowser.open(viewer.url)
-    if block:
-        viewer.wait()
-    return viewer
 
 
 class Viewer:
@@ -77,6 +83,7 @@ class Viewer:
         self._cache = Cache(results.load)
         self._fps = results.recording.fps or DEFAULT_FPS
         self._wanted, self._playing, self._closed = 0, False, False
+        self._failure: Exception | None = None
         self._changed = threading.Condition()
         self.scene = Scene(server, results.camera, self._cache.get(self._first_with_people()))
         self.panel = Panel(
@@ -139,6 +146,9 @@ class Viewer:
         self.go_to(position)
         with self._changed:
             self._changed.wait_for(lambda: self._closed or self.position == position or self._wanted != position)
+            failure, self._failure = self._failure, None
+        if failure is not None:
+            raise failure
 
     def _draw(self, position: int) -> None:
         moment = self._cache.get(position)
@@ -166,7 +176,13 @@ class Viewer:
                     return
                 target, playing = self._wanted, self._playing
             due = time.monotonic() + 1 / self._fps
-            self._draw(target)
+            try:
+                self._draw(target)
+            except Exception as e:  # the page must live on, and whoever waits must hear of it
+                logging.getLogger(__name__).exception("frame at position %d cannot be drawn", target)
+                with self._changed:
+                    self.position, self._failure = target, e
+                    self._changed.notify_all()
             if playing:
                 for ahead in range(1, AHEAD + 1):
                     self._cache.prefetch((target + ahead) % len(self))

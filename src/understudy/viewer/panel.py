@@ -95,7 +95,7 @@ class Panel:
         else:
             self._image.image = _empty(self._image.image)
         self._status.content = status_html(moment, position, self._frames)
-        self._people.content = people_html(moment.frame.people)
+        self._people.content = people_html(moment.frame.people, known=moment.frame.skipped is None)
 
 
 def _on(register: Callable[[Callable[[Any], None]], object], act: Callable[[], None]) -> None:
@@ -125,14 +125,15 @@ def status_html(moment: Moment, position: int, frames: int) -> str:
     return f'<div style="{_BOX}">{html}</div>'
 
 
-def people_html(people: tuple[Person, ...]) -> str:
+def people_html(people: tuple[Person, ...], *, known: bool = True) -> str:
     """One line per person: colour, id, torso distance, number of joints by source; or why there are none."""
+    nobody = "Nobody in this frame." if known else "Not looked at."
     lines = []
     for person in people:
         r, g, b = person_color(person.id)
         swatch = f'<span style="color:rgb({r},{g},{b});font-size:1.3em;-webkit-text-stroke:0.5px #222">●</span>'
         lines.append(f"<div>{swatch} <b>#{person.id}</b> {escape(describe_joints(person))}</div>")
-    return f'<div style="{_BOX}">{"".join(lines) or "Nobody in this frame."}</div>'
+    return f'<div style="{_BOX}">{"".join(lines) or nobody}</div>'
 
 
 def describe_joints(person: Person) -> str:

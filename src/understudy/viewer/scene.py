@@ -58,6 +58,7 @@ class Scene:
         """Up, floor, and a first view from above and aside on all the people."""
         people = first.lifted
         floor = find_floor(first.cloud.points if first.cloud is not None else None, people)
+        self._up = floor.up
         self._api.set_up_direction(tuple(floor.up))
         joints = np.concatenate([p.keypoints for p in people]) if people else np.array([[0.0, 0.0, 2.5]])
         joints = joints[np.isfinite(joints).all(axis=1)]
@@ -96,13 +97,15 @@ class Scene:
     def draw(self, moment: Moment) -> None:
         """Replaces what is shown. Call within `server.atomic()`."""
         before, self.nodes, self._clouds = self.nodes, {}, {}
-        if moment.cloud is not None:
-            self._draw_cloud(moment.cloud, moment.lifted)
-        for number, person in enumerate(moment.lifted):  # not the id: nothing makes ids differ within a frame
-            self._draw_person(person, number)
-        self._draw_camera(moment)
-        for name in before.keys() - self.nodes.keys():
-            before[name].remove()
+        try:
+            if moment.cloud is not None:
+                self._draw_cloud(moment.cloud, moment.lifted)
+            for number, person in enumerate(moment.lifted):  # not the id: nothing makes ids differ within a frame
+                self._draw_person(person, number)
+            self._draw_camera(moment)
+        finally:
+            for name in before.keys() - self.nodes.keys():
+                before[name].remove()
 
     def _draw_cloud(self, cloud: Cloud, people: tuple[Person, ...]) -> None:
         """People in two parts: few small points, through which their skeletons show, and the others."""
@@ -126,7 +129,7 @@ class Scene:
     def _draw_person(self, person: Person, number: int) -> None:
         where, color = f"/skeletons/{number}", person_color(person.id)
         known = np.isfinite(person.keypoints).all(axis=1)
-        inferred = np.array([s == INFERRED for s in person.source])
+        inferred = [s == INFERRED for s in person.source]
         bones = [b for b in BONES if known[list(b)].all()]
         if bones:
             colors = [[shade(bone_color(b, color), inferred[end]) for end in b] for b in bones]
@@ -154,7 +157,7 @@ class Scene:
             )
         )
         self._draw_palms(person, where)
-        top = person.keypoints[rows[np.argmin(person.keypoints[rows, 1])]] + (0.0, -0.16, 0.0)
+        top = person.keypoints[rows[np.argmax(person.keypoints[rows] @ self._up)]] + 0.16 * self._up
         self._keep(
             self._api.add_label(f"/labels/{number}", describe(person), position=tuple(top), anchor="bottom-center")
         )
