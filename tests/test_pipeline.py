@@ -115,6 +115,22 @@ def test_broken_frames_are_reported_and_skipped(recording, tmp_path, capsys):
     assert [f.index for f in again.frames if f.skipped] == [1]
 
 
+def test_a_frame_without_a_keypoint_file_is_skipped(recording, tmp_path):
+    """OpenPose writes a file for every frame; one that is missing or damaged costs its own frame only."""
+    folder = tmp_path / "openpose"
+    folder.mkdir()
+    rows = seen(10).rows().ravel().tolist()
+    for i in (0, 1, 3, 4):
+        (folder / f"{i}_keypoints.json").write_text(json.dumps({"people": [{"pose_keypoints_2d": rows}]}))
+    (folder / "3_keypoints.json").write_text("{")
+    result = estimate_recording(
+        recordings.open(recording), tmp_path / "out", detector=f"openpose-json:{folder}", overlays=False
+    )
+    skipped = {f.index: f.skipped for f in result.frames if f.skipped}
+    assert set(skipped) == {2, 3} and "no file for frame 2" in skipped[2] and "3_keypoints.json" in skipped[3]
+    assert [len(f.people) for f in result.frames] == [1, 1, 0, 0, 1]
+
+
 def test_all_zero_depth_lists_everybody_as_failed(tmp_path, capsys):
     frame = Frame(np.zeros((120, 160, 3), np.uint8), np.zeros((120, 160), np.float32), CAMERA)
     recordings.write_recording(tmp_path / "REC", [frame], keypoints2d={0: [seen(10), seen(60)]})
@@ -176,6 +192,10 @@ def test_pair_of_images(tmp_path, capsys, models):
     assert main(arguments) == 0  # again: nothing to do
     assert json.loads((tmp_path / "out" / "people.json").read_text())["frames"][0]["people"] == []
     assert len(recordings.open(tmp_path / "out" / "recording")) == 1
+    fine = [*arguments[:-1], str(tmp_path / "fine"), "--unit", "0.000125"]
+    assert main(fine) == 0
+    kept = recordings.open(tmp_path / "fine" / "recording")[0].depth
+    np.testing.assert_allclose(kept, 2000 * 0.000125, rtol=1e-6)
     assert main([*arguments[:-1], str(tmp_path / "o2"), "--unit", "0"]) == 2
     assert "unit_m" in capsys.readouterr().err
     cv2.imwrite(str(tmp_path / "d.png"), np.full((120, 160), 200, np.uint8))

@@ -123,7 +123,7 @@ def _estimate(arguments: argparse.Namespace) -> int:
 
     recording = _open(arguments)
     if arguments.recording is None:
-        recording = _kept_pair(recording, arguments.out / "recording")
+        recording = _kept_pair(recording, arguments.out / "recording", arguments.unit)
     result = estimate_recording(
         recording,
         arguments.out,
@@ -151,11 +151,11 @@ def _estimate(arguments: argparse.Namespace) -> int:
     return 1 if len(skipped) == len(result.frames) else 0
 
 
-def _kept_pair(pair: Recording, folder: Path) -> Recording:
+def _kept_pair(pair: Recording, folder: Path, unit_m: float) -> Recording:
     """The pair as a recording folder inside the results, so that they can be viewed later."""
     from understudy import recordings
 
-    recordings.write_recording(folder, pair, color_format="png", overwrite=True)
+    recordings.write_recording(folder, pair, unit_m=unit_m, color_format="png", overwrite=True)
     return recordings.open(folder)
 
 

@@ -22,7 +22,7 @@ import numpy as np
 import understudy
 from understudy import detectors
 from understudy.benchmark import Timed
-from understudy.errors import FrameError, RecordingError
+from understudy.errors import DetectorError, FrameError, RecordingError
 from understudy.estimator import Estimator
 from understudy.files import read_json, write_atomically
 from understudy.overlay import draw_frame
@@ -108,10 +108,10 @@ class _Run:
         times = self.recording.timestamps_s
         timestamp = None if times is None else times[position]
         try:
-            frame = self.recording[position]
-        except FrameError as error:
+            people = self._people(self.recording[position])
+        except (FrameError, DetectorError) as error:
             return FramePeople(index, (), timestamp, skipped=str(error))
-        return FramePeople(index, tuple(self._people(frame)), timestamp)
+        return FramePeople(index, tuple(people), timestamp)
 
     def _people(self, frame: Frame) -> list[Person]:
         registered = self.estimator.register(frame)

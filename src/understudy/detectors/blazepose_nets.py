@@ -7,10 +7,11 @@ non-maximum suppression, a rotated square region from two keypoints, heatmap ref
 
 from __future__ import annotations
 
+import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from threading import local
+from threading import Lock, local
 from typing import Any
 
 import cv2
@@ -110,10 +111,7 @@ class BlazePoseNets:
         """Outputs of one network, in its own order."""
         interpreters = self._local.__dict__.setdefault("interpreters", {})
         if name not in interpreters:
-            from ai_edge_litert.interpreter import Interpreter
-
-            interpreter = Interpreter(str(self._paths[name]), num_threads=1)
-            interpreter.allocate_tensors()
+            interpreter = _interpreter(self._paths[name])
             ins, outs = interpreter.get_input_details(), interpreter.get_output_details()
             interpreters[name] = interpreter, ins[0]["index"], [o["index"] for o in outs]
         interpreter, source, sinks = interpreters[name]
@@ -165,6 +163,25 @@ class BlazePoseNets:
             score=float(score[0, 0]),
             next_region=Region.from_points(uv[_AUXILIARY[0]], uv[_AUXILIARY[1]]),
         )
+
+
+_LOADING = Lock()
+
+
+def _interpreter(path: Path) -> Any:
+    """A LiteRT interpreter. Its native code writes a line of information to stderr, which would cut progress bars."""
+    from ai_edge_litert.interpreter import Interpreter
+
+    with _LOADING, open(os.devnull, "wb") as nowhere:
+        stderr = os.dup(2)
+        try:
+            os.dup2(nowhere.fileno(), 2)
+            interpreter = Interpreter(str(path), num_threads=1)
+            interpreter.allocate_tensors()
+        finally:
+            os.dup2(stderr, 2)
+            os.close(stderr)
+    return interpreter
 
 
 def _weighted_suppression(score: np.ndarray, corners: np.ndarray, keypoints: np.ndarray) -> np.ndarray:
