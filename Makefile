@@ -20,7 +20,8 @@ help:
 demo: $(VENV)/user.stamp
 	$(BIN)/understudy models fetch
 	$(BIN)/understudy estimate sample --out demo
-	@echo; echo "Made by 'make demo' (look at these):"; ls demo/overlays/*.png; echo demo/people.json
+	@echo; echo "Made by 'make demo' (look at these):"; ls demo/overlays/*.png; echo demo/people.json; \
+	  echo "In 3D: $(BIN)/understudy view demo"
 
 test: $(VENV)/dev.stamp
 	$(BIN)/understudy models fetch

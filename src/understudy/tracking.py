@@ -42,7 +42,7 @@ class IdentityTracker:
         self._tracks = [t for t in self._tracks if t.age <= MEMORY]
         cost = np.array([[_cost(t, p) for t in self._tracks] for p in people]).reshape(len(people), len(self._tracks))
         out: list[Person | None] = [None] * len(people)
-        for i, j in zip(*linear_sum_assignment(cost), strict=True):
+        for i, j in np.transpose(linear_sum_assignment(cost)).tolist():
             if cost[i, j] < 1:
                 out[i] = self._follow(self._tracks[j], people[i])
         for i, person in enumerate(people):
