@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from understudy import recordings
 from understudy.detectors import Detector, create
-from understudy.detectors.blazepose import Candidate, distinct, merge_duplicates
+from understudy.detectors.blazepose import Candidate, Sighting, distinct, merge_duplicates
 from understudy.detectors.blazepose_nets import _ANCHORS, _MIRROR, Region, _refine, _weighted_suppression
 from understudy.registration import register
 from understudy.skeleton import JOINT, N_JOINTS, rows
@@ -82,11 +82,11 @@ def test_candidates_of_one_person_are_merged_and_of_two_kept():
     assert len(distinct([candidate(100, -1), candidate(120, 0)])) == 1
 
 
-def person(x: float, score: float = 0.9) -> Keypoints2D:
+def person(x: float, score: float = 0.9) -> Sighting:
     uv = np.column_stack([np.full(N_JOINTS, x), np.linspace(100, 300, N_JOINTS)])
     uv[rows("right_shoulder", "left_shoulder"), 1] = 130
     uv[rows("right_hip", "left_hip"), 1] = 190
-    return Keypoints2D.where(uv, np.full(N_JOINTS, score))
+    return Sighting(Keypoints2D.where(uv, np.full(N_JOINTS, score)), 60.0)
 
 
 def test_duplicates_go_and_neighbours_stay():

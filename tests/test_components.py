@@ -62,8 +62,20 @@ def test_floor_is_found_and_removed(camera: Camera):
 
 def test_no_floor_where_there_is_only_a_wall(camera: Camera):
     grid = DepthGrid(RegisteredDepth(room(camera, [], floor=False), camera), camera)
-    assert fit_floor(grid.points[grid.z > 0]) is None
-    assert fit_floor(np.zeros((0, 3), np.float32)) is None
+    assert grid.floor is None
+    assert fit_floor(np.zeros((9, 16, 3), np.float32), np.zeros((9, 16), bool)) is None
+
+
+def test_a_table_is_not_a_floor_when_the_floor_is_seen(camera: Camera):
+    """Cells of a level surface at half height are many, but the floor lies beneath them."""
+    u, v = np.meshgrid(np.arange(960), np.arange(540))
+    ray = camera.unproject(np.stack([u, v], -1).astype(float), 1.0)
+    with np.errstate(divide="ignore"):
+        floor, table = np.where(ray[..., 1] > 0, HEIGHT / ray[..., 1], np.inf), 0.6 / ray[..., 1]
+    on_table = (table > 1) & (table < 3) & (np.abs(ray[..., 0] * table) < 0.8)
+    z = np.minimum(np.where(on_table, table, floor), 4.0).astype(np.float32)
+    grid = DepthGrid(RegisteredDepth(z, camera), camera)
+    assert grid.floor is not None and grid.floor[3] == pytest.approx(HEIGHT, abs=0.03)
 
 
 def test_hidden_people_are_greyed_out_and_only_they(camera: Camera):

@@ -15,12 +15,13 @@ from understudy.assets import model_path
 from understudy.camera import Camera
 from understudy.detectors.blazepose_nets import DETECTOR_SIZE, LANDMARK_SIZE, BlazePoseNets, Landmarks, Region
 from understudy.detectors.windows import Scene, windows
-from understudy.skeleton import FACE, JOINT, TORSO, to_coco18
+from understudy.skeleton import FACE, JOINT, N_JOINTS, TORSO, to_coco18
 from understudy.types import Keypoints2D, RegisteredDepth
 
 _ON_PERSON, _UNMEASURED, _BEHIND_OTHER, _OFF_PERSON = 1.0, 0.9, 0.35, 0.25
 """What a keypoint's place is worth: on its person, in a depth hole, hidden by something nearer, on the background"""
 _SHOULDERS, _HIPS = TORSO[1:3], TORSO[3:5]
+_BODY = np.setdiff1d(np.arange(N_JOINTS), FACE)
 
 
 @dataclass(frozen=True)
@@ -34,6 +35,29 @@ class Candidate:
     """mid hip to mid shoulder, pixels"""
     group: int
     """index of the thing in the depth image, -1 if none"""
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """Somebody, with the landmarks."""
+
+    keypoints: Keypoints2D
+    torso: float
+    """mid hip to mid shoulder, pixels; known also when some of these are outside the image"""
+
+    def life_size(self, scene: Scene) -> bool:
+        """Whether the torso could be a person's, however turned or bent. True where its depth is not known."""
+        z = self.keypoints.torso_z
+        return z is None or 0.08 < self.torso / scene.pixels_per_metre(z) < 1.1
+
+    def coincides(self, other: Sighting) -> bool:
+        """Whether the joints of both lie within a quarter of a torso of each other (median; the face left out)."""
+        p, q = self.keypoints, other.keypoints
+        both = _BODY[p.found[_BODY] & q.found[_BODY]]
+        if len(both) < 3:
+            return False
+        apart = float(np.median(np.linalg.norm(p.uv[both] - q.uv[both], axis=1)))
+        return apart < 0.25 * max(self.torso, other.torso)
 
 
 class BlazePoseDetector:
@@ -59,7 +83,7 @@ class BlazePoseDetector:
             for candidate, three in zip(candidates, looks, strict=True)
             if max(look.score for look in three) >= self.min_score
         ]
-        return merge_duplicates([p for p in people if scene is None or _life_size(p, scene)])
+        return merge_duplicates([p for p in people if scene is None or p.life_size(scene)])
 
     @staticmethod
     def _scene(color: np.ndarray, depth: RegisteredDepth | None) -> Scene | None:
@@ -120,7 +144,7 @@ class BlazePoseDetector:
         return [c if h is None else scene.hide(c, r, h) for c, r, h in zip(crops, regions, hidden, strict=True)]
 
     @staticmethod
-    def _fuse(scene: Scene | None, candidate: Candidate, looks: list[Float[np.ndarray, "18 3"]]) -> Keypoints2D:
+    def _fuse(scene: Scene | None, candidate: Candidate, looks: list[Float[np.ndarray, "18 3"]]) -> Sighting:
         """One person from the three looks. The masked ones place the joints; the plain one can only lower a score."""
         plain, checked, mirrored = looks
         torso = max(_torso_length(checked), 0.5 * candidate.torso, 1.0)
@@ -138,20 +162,12 @@ class BlazePoseDetector:
         rows[:, 2] *= place * _agreement(apart, 0.2) * _agreement(from_plain, 0.4)
         rows[JOINT["neck"], :2] = rows[_SHOULDERS, :2].mean(0)
         rows[JOINT["neck"], 2] = rows[_SHOULDERS, 2].min()
-        return Keypoints2D.where(rows[:, :2], rows[:, 2], torso_z)
+        return Sighting(Keypoints2D.where(rows[:, :2], rows[:, 2], torso_z), torso)
 
 
 def _torso_length(rows: np.ndarray) -> float:
     """Mid shoulders to mid hips, pixels."""
     return float(np.linalg.norm(rows[_SHOULDERS, :2].mean(0) - rows[_HIPS, :2].mean(0)))
-
-
-def _life_size(person: Keypoints2D, scene: Scene) -> bool:
-    """Whether the torso's length could be a person's, however turned or bent. True where its depth is not known."""
-    if person.torso_z is None:
-        return True
-    metres = _torso_length(person.uv) * person.torso_z / (scene.grid.camera.fx * scene.grid.color_pixels)
-    return 0.08 < metres < 1.1
 
 
 def _agreement(apart: np.ndarray, least: float) -> np.ndarray:
@@ -222,19 +238,10 @@ def _same(a: Candidate, b: Candidate) -> bool:
     return distance < 0.5
 
 
-def merge_duplicates(people: list[Keypoints2D]) -> list[Keypoints2D]:
-    """Drops the weaker of two whose confident joints coincide (median distance under a quarter of a torso)."""
-    out: list[Keypoints2D] = []
-    for p in sorted(people, key=lambda p: -p.score.sum()):
-        if (p.score > 0.2).sum() >= 4 and not any(_coincide(p, q) for q in out):
+def merge_duplicates(people: list[Sighting]) -> list[Keypoints2D]:
+    """Drops the weaker of two who coincide, and who has fewer than 4 joints that can be trusted."""
+    out: list[Sighting] = []
+    for p in sorted(people, key=lambda p: -p.keypoints.score.sum()):
+        if (p.keypoints.score > 0.3).sum() >= 4 and not any(p.coincides(q) for q in out):
             out.append(p)
-    return out
-
-
-def _coincide(p: Keypoints2D, q: Keypoints2D) -> bool:
-    body = np.setdiff1d(np.arange(18), FACE)
-    both = body[(p.score[body] > 0) & (q.score[body] > 0)]
-    if len(both) < 3:
-        return False
-    apart = float(np.median(np.linalg.norm(p.uv[both] - q.uv[both], axis=1)))
-    return apart < 0.25 * max(_torso_length(q.uv), 1.0)
+    return [p.keypoints for p in out]

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Float, Float32, Int
+from jaxtyping import Bool, Float, Float32, Int
 from scipy.ndimage import distance_transform_edt
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
@@ -74,7 +74,7 @@ class DepthGrid:
     @cached_property
     def floor(self) -> Float[np.ndarray, "4"] | None:
         """Plane (unit normal up, offset): n . p + d = height above the floor in metres; None if none is seen."""
-        return fit_floor(self.points[self.z > 0])
+        return fit_floor(self.points, self.z > 0)
 
     @cached_property
     def labels(self) -> Int[np.ndarray, "gh gw"]:
@@ -173,16 +173,22 @@ def _is_full_of_gaps(z: np.ndarray) -> bool:
     return bool(6 * (between & (z == 0)).sum() > (z > 0).sum())
 
 
-def fit_floor(points: Float32[np.ndarray, "n 3"], trials: int = 120) -> Float[np.ndarray, "4"] | None:
-    """The plane that people stand on, by RANSAC: about level (within 45 degrees of the camera's y), below the camera,
-    and with next to nothing beneath it. None if there is no such plane. Deterministic.
+def fit_floor(
+    points: Float32[np.ndarray, "gh gw 3"], measured: Bool[np.ndarray, "gh gw"], trials: int = 120
+) -> Float[np.ndarray, "4"] | None:
+    """The plane that people stand on, by RANSAC over the cells whose surface faces upwards.
+
+    About level (within 45 degrees of the camera's y), below the camera, with next to nothing beneath it. None if there
+    is no such plane. Deterministic.
     """
-    if len(points) < 200:
-        return None
     rng = np.random.default_rng(0)
-    sample = points[rng.choice(len(points), min(len(points), 1500), replace=False)].astype(np.float64)
-    low = sample[sample[:, 1] > np.median(sample[:, 1])]
-    a, b, c = low[rng.integers(0, len(low), (3, trials))]
+    upward = points[_faces_up(points, measured)].astype(np.float64)
+    everything = points[measured].astype(np.float64)
+    if len(upward) < max(60, 0.02 * len(everything)):
+        return None
+    upward = upward[rng.choice(len(upward), min(len(upward), 800), replace=False)]
+    sample = everything[rng.choice(len(everything), min(len(everything), 1500), replace=False)]
+    a, b, c = upward[rng.integers(0, len(upward), (3, trials))]
     normal = np.cross(b - a, c - a)
     length = np.linalg.norm(normal, axis=1)
     ok = length > 1e-3
@@ -193,14 +199,30 @@ def fit_floor(points: Float32[np.ndarray, "n 3"], trials: int = 120) -> Float[np
     if not good.any():
         return None
     normal, offset = normal[good], offset[good]
-    height = sample @ normal.T + offset
-    tolerance = (0.03 + 0.01 * sample[:, 2])[:, None]
-    support = (np.abs(height) < tolerance).sum(0) - 3 * (height < -3 * tolerance).sum(0)
+    tolerance = (0.03 + 0.01 * upward[:, 2])[:, None]
+    on = np.abs(upward @ normal.T + offset) < tolerance
+    beneath = (sample @ normal.T + offset < -3 * (0.03 + 0.01 * sample[:, 2])[:, None]).mean(0)
+    support = on.mean(0) - 3 * beneath
     best = int(np.argmax(support))
-    if support[best] < 0.04 * len(sample):
+    if support[best] < 0.2:
         return None
-    inliers = sample[np.abs(height[:, best]) < tolerance[:, 0]]
+    inliers = upward[on[:, best]]
     center = inliers.mean(0)
     refined = np.linalg.svd(inliers - center, full_matrices=False)[2][2]
     refined *= -np.sign(refined[1])
     return np.append(refined, -refined @ center)
+
+
+def _faces_up(points: np.ndarray, measured: np.ndarray, step: int = 2) -> np.ndarray:
+    """Cells whose surface normal, from the cells `step` away on each side, is within 45 degrees of up (-y)."""
+    out = np.zeros(measured.shape, bool)
+    if min(measured.shape) <= 2 * step:
+        return out
+    inner = slice(step, -step)
+    across = points[inner, 2 * step :] - points[inner, : -2 * step]
+    down = points[2 * step :, inner] - points[: -2 * step, inner]
+    normal = np.cross(down, across)  # towards the camera
+    known = measured[inner, inner] & measured[inner, 2 * step :] & measured[inner, : -2 * step]
+    known &= measured[2 * step :, inner] & measured[: -2 * step, inner]
+    out[inner, inner] = known & (normal[..., 1] < -0.7 * np.linalg.norm(normal, axis=-1))
+    return out

@@ -19,6 +19,8 @@ from understudy.detectors.components import Component, DepthGrid
 from understudy.types import RegisteredDepth
 
 _MARGIN = 1.25  # window side over the larger side of the thing
+PERSON = 1.7
+"""metres: a standing person's height, for windows around people who are cut off"""
 MAX_JOINED = 10
 """tiles on walls and furniture"""
 _FILL = 128  # grey level of what is hidden
@@ -63,6 +65,10 @@ class Scene:
         others = [i for i, g in enumerate(self.groups) if g.compact and i != group]
         return np.isin(self.group_of_cell, others)
 
+    def pixels_per_metre(self, z: float) -> float:
+        """Colour pixels that a metre covers at a depth."""
+        return self.grid.camera.fx * self.grid.color_pixels / z
+
     def groups_at(self, uv: Float[np.ndarray, "n 2"]) -> np.ndarray:
         """Group under each pixel, -1 for none; shape (n,)."""
         row, col, inside = self.grid.cells_of(uv)
@@ -96,8 +102,19 @@ def windows(width: int, height: int, scene: Scene | None) -> list[Window]:
     """Where to look in an image of width x height."""
     if scene is None:
         return [Window(r, None) for r in tiles(width, height, (1.0, 0.67))]
-    found = [Window(_around(g.box), i) for i, g in enumerate(scene.groups) if g.compact]
+    found = [Window(_completed(g, width, height, scene), i) for i, g in enumerate(scene.groups) if g.compact]
     return found + [Window(r, None) for r in tiles(width, height, (1.0,)) + _joined(width, height, scene)]
+
+
+def _completed(group: Group, width: int, height: int, scene: Scene) -> Region:
+    """A window around a group; where the image's border cuts it off, as large as if the rest of a person were there."""
+    left, top, right, bottom = group.box
+    rim = 2 * scene.grid.color_pixels
+    if bottom > height - rim:
+        bottom = max(bottom, top + PERSON * scene.pixels_per_metre(group.z))
+    elif top < rim:
+        top = min(top, bottom - PERSON * scene.pixels_per_metre(group.z))
+    return _around((left, top, right, bottom))
 
 
 def _joined(width: int, height: int, scene: Scene) -> list[Region]:
@@ -106,8 +123,7 @@ def _joined(width: int, height: int, scene: Scene) -> list[Region]:
     row, col = np.nonzero(np.isin(scene.group_of_cell, large) & (scene.grid.z > 0))
     if not len(row):
         return []
-    pixels_per_metre = scene.grid.camera.fx / float(np.median(scene.grid.z[row, col])) * scene.grid.color_pixels
-    side = max(2.6 * pixels_per_metre, 0.35 * min(width, height))
+    side = max(2.6 * scene.pixels_per_metre(float(np.median(scene.grid.z[row, col]))), 0.35 * min(width, height))
     if side > 0.75 * min(width, height):
         return []
     (left, right), (top, bottom) = (scene.grid.edges_to_color(int(a.min()), int(a.max())) for a in (col, row))
