@@ -46,9 +46,13 @@ class Sighting:
     """mid hip to mid shoulder, pixels; known also when some of these are outside the image"""
 
     def life_size(self, scene: Scene) -> bool:
-        """Whether the torso could be a person's, however turned or bent. True where its depth is not known."""
+        """Whether torso and extent could be a person's, however turned, bent or cut off. True without depth."""
         z = self.keypoints.torso_z
-        return z is None or 0.08 < self.torso / scene.pixels_per_metre(z) < 1.1
+        if z is None or not self.keypoints.found.any():
+            return True
+        metre = scene.pixels_per_metre(z)
+        extent = float(np.ptp(self.keypoints.uv[self.keypoints.found], axis=0).max())
+        return 0.08 < self.torso / metre < 1.1 and extent > 0.3 * metre
 
     def coincides(self, other: Sighting) -> bool:
         """Whether the joints of both lie within a quarter of a torso of each other (median; the face left out)."""
