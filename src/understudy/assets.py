@@ -7,6 +7,7 @@ cache folder: `$UNDERSTUDY_CACHE`, else `$XDG_CACHE_HOME/understudy`, else `~/.c
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import os
 import subprocess
@@ -198,15 +199,19 @@ def _download(wheel: Wheel, folder: Path, progress: Progress | None) -> Path:
 
 def _watch(folder: Path, total: int, progress: Progress | None, stop: threading.Event) -> None:
     while progress is not None and not stop.wait(0.1):
-        sizes = []
-        for file in folder.rglob("*"):
-            try:
-                sizes.append(file.stat().st_size)
-            except OSError:  # pip moved it meanwhile
-                continue
-        progress(min(sum(sizes), total), total)
+        progress(min(_bytes_in(folder), total), total)
     if progress is not None:
         progress(total, total)
+
+
+def _bytes_in(folder: Path) -> int:
+    """Size of all files below a folder, while pip makes, moves and removes them (os.walk passes over what vanishes)."""
+    size = 0
+    for place, _, files in os.walk(folder):
+        for name in files:
+            with contextlib.suppress(OSError):
+                size += os.stat(os.path.join(place, name)).st_size
+    return size
 
 
 def _offline_message(wheel: Wheel, messages: str) -> str:
