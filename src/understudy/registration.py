@@ -37,7 +37,7 @@ class DepthRegistration:
         rays = np.column_stack([xy, np.ones(len(xy))]) @ R.T
         self._rays = np.ascontiguousarray(rays.T, dtype=np.float32)  # NaN where the lens model has no ray
         self._t = t.tolist()
-        # How many colour pixels lie between neighbouring depth samples; nearness can double it for near surfaces.
+        # colour pixels between neighbouring depth samples
         spacing = max(camera.color.fx / depth.fx, camera.color.fy / depth.fy)
         size = int(np.ceil(spacing)) + 1
         self._bridge = np.ones((size, size), np.uint8)
