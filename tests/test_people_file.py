@@ -76,6 +76,16 @@ def test_what_the_format_says(tmp_path):
         ({"frames": [{"people": []}]}, r"frames\[0\]: must be an object with a whole number 'index'"),
         ({"frames": [{"index": 0}]}, r"frames\[0\]: field 'people' must be a list"),
         ({"frames": [{"index": 0, "people": [{}]}]}, r"people\[0\].keypoints_2d: must be a list of 18 rows"),
+        ({"frames": [{"index": 0, "people": [], "timestamp_s": "x"}]}, "timestamp_s: must be a number, got 'x'"),
+        ({"frames": [{"index": 0, "people": [], "skipped": 1}]}, "skipped: must be a text"),
+        (
+            {"frames": [{"index": 0, "people": [{"id": "x", "keypoints_2d": [[1, 2, 0.5]] * 18}]}]},
+            r"\].id: must be a whole",
+        ),
+        (
+            {"frames": [{"index": 0, "people": [{"hands": [1], "keypoints_2d": [[1, 2, 0.5]] * 18}]}]},
+            "hands: must be an obj",
+        ),
     ],
 )
 def test_damaged(tmp_path, change, message):

@@ -56,7 +56,7 @@ def test_whole_recording(recording, tmp_path):
     assert {len(f.people) for f in result.frames} == {2}
     read = PeopleFile.read(out / "people.json")
     np.testing.assert_allclose(read.frames[2].people[0].keypoints, result.frames[2].people[0].keypoints, atol=1e-4)
-    assert sorted(p.name for p in out.iterdir()) == ["config.json", "overlays", "people.json"]
+    assert sorted(p.name for p in out.iterdir()) == ["config.json", "journal.jsonl", "overlays", "people.json"]
     assert len(list((out / "overlays").glob("*.png"))) == FRAMES
     picture = cv2.imread(str(out / "overlays" / "000000.png"))
     assert picture.shape[0] == 120 and picture.std() > 5
@@ -79,21 +79,21 @@ def test_resumes_where_it_stopped(recording, tmp_path, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         run(recording, tmp_path / "out", overlays=False)
     assert len(PeopleFile.read(tmp_path / "out" / "people.json").frames) == 2  # can be looked at already
-    journal = tmp_path / "out" / "people.jsonl"
+    journal = tmp_path / "out" / "journal.jsonl"
     assert len(journal.read_text().splitlines()) == 2
     journal.write_text(journal.read_text() + '{"index": 2, "peop')  # as a crash in mid-line leaves it
     (tmp_path / "out" / "people.json").unlink()
     again = run(recording, tmp_path / "out", overlays=False)
     assert calls == [0, 1, 2, 2, 3, 4]
     assert (tmp_path / "out" / "people.json").read_text() == (tmp_path / "whole" / "people.json").read_text()
-    assert len(again.frames) == len(whole.frames) and not journal.exists()
+    assert len(again.frames) == len(whole.frames)
     run(recording, tmp_path / "out", overlays=False)
     assert len(calls) == 6  # nothing left to do
 
 
 def test_other_settings_do_not_mix(recording, tmp_path):
     run(recording, tmp_path / "out", overlays=False)
-    with pytest.raises(RecordingError, match=r"other settings \(min_score was 0.2, is 0.5\).*--restart"):
+    with pytest.raises(RecordingError, match=r"other settings \(min_score differs: 0.2 then, 0.5 now\).*--restart"):
         run(recording, tmp_path / "out", min_score=0.5)
     assert len(run(recording, tmp_path / "out", min_score=0.5, restart=True).frames) == FRAMES
 
@@ -113,6 +113,99 @@ def test_broken_frames_are_reported_and_skipped(recording, tmp_path, capsys):
     (recording / "color" / "000003.png").write_bytes(data)  # mended: the same command takes it in
     again = run(recording, tmp_path / "out")
     assert [f.index for f in again.frames if f.skipped] == [1]
+
+
+def test_a_mended_frame_fits_in(recording, tmp_path):
+    """A frame that was broken in the first run: after the second, all is as if it had never been broken."""
+    whole = run(recording, tmp_path / "whole")
+    path = recording / "color" / "000000.png"
+    data = path.read_bytes()
+    path.write_bytes(data[:200])
+    broken = run(recording, tmp_path / "out")
+    assert broken.frames[0].skipped and not (tmp_path / "out" / "overlays" / "000000.png").exists()
+    path.write_bytes(data)
+    run(recording, tmp_path / "out")
+    assert (tmp_path / "out" / "people.json").read_text() == (tmp_path / "whole" / "people.json").read_text()
+    for picture in (tmp_path / "whole" / "overlays").iterdir():
+        mended = cv2.imread(str(tmp_path / "out" / "overlays" / picture.name)).astype(int)
+        # results are kept to a tenth of a millimetre, so lines may differ at their rims; other ids have other colours
+        assert np.abs(mended - cv2.imread(str(picture))).mean() < 0.5
+    assert len(whole.frames) == FRAMES
+
+
+def test_changed_images_are_estimated_again(recording, tmp_path, monkeypatch):
+    first = run(recording, tmp_path / "out")
+    cv2.imwrite(str(recording / "depth" / "000002.png"), np.full((120, 160), 3000, np.uint16))
+    calls, estimate = [], Estimator.estimate
+    monkeypatch.setattr(Estimator, "estimate", lambda self, f: calls.append(f.index) or estimate(self, f))
+    second = run(recording, tmp_path / "out")
+    assert calls == [2]
+    assert np.nanmedian(first.frames[2].people[0].keypoints[:, 2]) == pytest.approx(2)
+    assert np.nanmedian(second.frames[2].people[0].keypoints[:, 2]) == pytest.approx(3)
+
+
+def test_changed_keypoints_or_cameras_need_a_restart(recording, tmp_path):
+    run(recording, tmp_path / "out")
+    keypoints = recording / "keypoints2d.json"
+    keypoints.write_text(keypoints.read_text().replace(" ", "") + " ")
+    with pytest.raises(RecordingError, match="detector_input differs"):
+        run(recording, tmp_path / "out")
+    run(recording, tmp_path / "out", restart=True)
+    info = json.loads((recording / "recording.json").read_text())
+    info["color"]["K"][0][0] = info["depth"]["K"][0][0] = info["color"]["K"][0][0] + 10
+    (recording / "recording.json").write_text(json.dumps(info))
+    with pytest.raises(RecordingError, match=r"cameras differs.*--restart"):
+        run(recording, tmp_path / "out")
+
+
+def test_frames_that_vanished_are_left_out_with_a_word(recording, tmp_path):
+    run(recording, tmp_path / "out")
+    for kind in ("color", "depth"):
+        (recording / kind / "000004.png").unlink()
+    info = json.loads((recording / "recording.json").read_text())
+    (recording / "recording.json").write_text(json.dumps({**info, "timestamps_s": info["timestamps_s"][:4]}))
+    with pytest.warns(UserWarning, match="1 frames are no longer in"):
+        assert len(run(recording, tmp_path / "out").frames) == 4
+
+
+def test_missing_pictures_are_drawn_without_estimating(recording, tmp_path, monkeypatch):
+    run(recording, tmp_path / "out", overlays=False)
+    assert not (tmp_path / "out" / "overlays").exists()
+    monkeypatch.setattr(Estimator, "estimate", lambda self, frame: pytest.fail("estimated again"))
+    run(recording, tmp_path / "out")
+    assert len(list((tmp_path / "out" / "overlays").glob("*.png"))) == FRAMES
+
+
+@pytest.mark.parametrize("name", ["config.json", "people.json", "overlays", "journal.jsonl", "pair"])
+@pytest.mark.parametrize("restart", [False, True])
+def test_what_is_not_ours_stays(recording, tmp_path, name, restart):
+    out = tmp_path / "out"
+    out.mkdir()
+    if "." in name:
+        (out / name).write_text('{"mine": 1}')
+    else:
+        (out / name).mkdir()
+        (out / name / "000000.png").write_bytes(b"mine")
+    before = {p: p.read_bytes() for p in out.rglob("*") if p.is_file()}
+    with pytest.raises(RecordingError, match=f"holds {name}, which .* did not write there"):
+        run(recording, out, restart=restart)
+    assert {p: p.read_bytes() for p in out.rglob("*") if p.is_file()} == before
+
+
+def test_restart_removes_only_its_own_pictures(recording, tmp_path):
+    run(recording, tmp_path / "out")
+    photo = tmp_path / "out" / "overlays" / "0_photo.png"
+    photo.write_bytes(b"mine")
+    run(recording, tmp_path / "out", restart=True, overlays=False)
+    assert [p.name for p in (tmp_path / "out" / "overlays").iterdir()] == ["0_photo.png"]
+
+
+def test_damaged_journal(recording, tmp_path):
+    run(recording, tmp_path / "out", overlays=False)
+    journal = tmp_path / "out" / "journal.jsonl"
+    journal.write_text('{"index": 0, "people": ' + 100_000 * "[" + "\n")
+    with pytest.raises(RecordingError, match=r"journal\.jsonl: line 1: not readable as JSON.*--restart"):
+        run(recording, tmp_path / "out", overlays=False)
 
 
 def test_a_frame_without_a_keypoint_file_is_skipped(recording, tmp_path):
@@ -155,7 +248,8 @@ def test_estimator_refuses_what_it_does_not_know():
     [
         (["estimate", "/absent", "--out", "OUT"], "/absent: no such file or folder"),
         (["estimate", "--out", "OUT"], "give RECORDING, or a single colour/depth pair"),
-        (["estimate", "REC", "--color", "c.png", "--out", "OUT"], "not both"),
+        (["estimate", "REC", "--color", "c.png", "--out", "OUT"], "--color goes with a pair of images"),
+        (["info", "REC", "--unit", "0.001"], "--unit goes with a pair of images"),
         (["estimate", "REC", "--out", "OUT", "--detector", "yolo"], "detector 'yolo': must be one of"),
         (["estimate", "REC", "--out", "OUT", "--method", "magic"], "method 'magic': must be one of 'naive'"),
         (["view", "OUT"], "people.json"),
@@ -191,13 +285,20 @@ def test_pair_of_images(tmp_path, capsys, models):
     assert main(arguments) == 0
     assert main(arguments) == 0  # again: nothing to do
     assert json.loads((tmp_path / "out" / "people.json").read_text())["frames"][0]["people"] == []
-    assert len(recordings.open(tmp_path / "out" / "recording")) == 1
+    assert len(recordings.open(tmp_path / "out" / "pair")) == 1
+    assert json.loads((tmp_path / "out" / "people.json").read_text())["recording"] == "c.png"
     fine = [*arguments[:-1], str(tmp_path / "fine"), "--unit", "0.000125"]
     assert main(fine) == 0
-    kept = recordings.open(tmp_path / "fine" / "recording")[0].depth
+    kept = recordings.open(tmp_path / "fine" / "pair")[0].depth
     np.testing.assert_allclose(kept, 2000 * 0.000125, rtol=1e-6)
     assert main([*arguments[:-1], str(tmp_path / "o2"), "--unit", "0"]) == 2
     assert "unit_m" in capsys.readouterr().err
+    cv2.imwrite(str(tmp_path / "d.png"), np.full((120, 160), 3000, np.uint16))
+    assert main(arguments) == 0  # another image: estimated anew
+    assert recordings.open(tmp_path / "out" / "pair")[0].depth[0, 0] == pytest.approx(3)
+    arguments[arguments.index("140")] = "150"
+    assert main(arguments) == 2
+    assert "cameras differs" in capsys.readouterr().err
     cv2.imwrite(str(tmp_path / "d.png"), np.full((120, 160), 200, np.uint8))
     assert main([*arguments[:-1], str(tmp_path / "o3")]) == 2
     assert "d.png" in capsys.readouterr().err

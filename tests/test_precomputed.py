@@ -53,7 +53,10 @@ def test_people_without_keypoints_are_not_people(tmp_path):
         ('{"persons": []}', "0.json: not OpenPose's JSON"),
         ('{"people": [{"pose_keypoints_2d": [1, 2]}]}', "0.json: not OpenPose's JSON"),
         ('{"people": [{"pose_keypoints_2d": [1, 2, 0.5]}]}', "has 1 keypoints; known: .17, 18, 25"),
-        ('{"people": [{"pose_keypoints_2d": [NaN, 2, 0.5]}]}', "not finite"),
+        ('{"people": [{"pose_keypoints_2d": [null, 2, 0.5]}]}', "not numbers"),
+        ('{"people": [{"pose_keypoints_2d": [NaN, 2, 0.5]}]}', "NaN is not JSON"),
+        ('{"people": [{"pose_keypoints_2d": [1e999, 2, 0.5]}]}', "the number 1e999"),
+        ('{"people": ' + 100_000 * "[", "not readable as JSON"),
     ],
 )
 def test_damaged_files(tmp_path, content, message):

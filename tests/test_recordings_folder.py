@@ -199,9 +199,9 @@ def test_opening_reads_no_image(folder, monkeypatch):
     monkeypatch.setattr(Path, "read_bytes", lambda self: opened.append(self.name) or read_bytes(self))
     r = recordings.open(folder)
     frames = iter(r)
-    assert opened == []
+    assert opened == ["recording.json"]
     next(frames)
-    assert opened == ["000000.png", "000000.png"]
+    assert opened == ["recording.json", "000000.png", "000000.png"]
 
 
 def test_broken_frames_are_reported_and_left_out(folder):

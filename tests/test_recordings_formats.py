@@ -415,7 +415,7 @@ def test_kinect_needs_its_extra(tmp_path, monkeypatch):
 
     monkeypatch.setattr(builtins, "__import__", without_av)
     (tmp_path / "a.mkv").write_bytes(b"")
-    with pytest.raises(MissingExtraError, match=r"Azure Kinect .mkv files .* pip install 'understudy\[kinect\]'"):
+    with pytest.raises(MissingExtraError, match=r"Azure Kinect .mkv files: .* pip install 'understudy\[kinect\]'"):
         recordings.open(tmp_path / "a.mkv")
 
 

@@ -7,6 +7,7 @@ x'' = x * radial + 2 p1 x y + p2 (r2 + 2 x^2) and y'' = y * radial + p1 (r2 + 2 
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -39,19 +40,24 @@ class Camera:
 
     def __post_init__(self) -> None:
         try:
-            K = np.asarray(self.K, dtype=np.float64)
+            width, height = operator.index(self.width), operator.index(self.height)
+            K = np.array(self.K, dtype=np.float64)  # a copy: the caller's array stays the caller's
             coefficients = tuple(float(c) for c in self.distortion)
         except (TypeError, ValueError) as e:
-            raise CameraError(f"K and distortion must hold numbers: {e}") from e
-        if not (self.width > 0 and self.height > 0):
-            raise CameraError(f"width and height must be positive, got {self.width} x {self.height}")
-        if K.shape != (3, 3) or not np.isfinite(K).all():
-            raise CameraError(f"K must be a finite 3x3 matrix, got shape {K.shape}")
+            raise CameraError(f"width and height must be whole numbers, K 3x3 and distortion numbers: {e}") from e
+        if not (width > 0 and height > 0):
+            raise CameraError(f"width and height must be positive, got {width} x {height}")
+        if K.shape != (3, 3):
+            raise CameraError(f"K must be a 3x3 matrix, got shape {K.shape}")
+        if not np.isfinite(K).all():
+            raise CameraError(f"K must hold numbers only, got {K.tolist()}")
         if K[0, 0] <= 0 or K[1, 1] <= 0:
             raise CameraError(f"K: focal lengths must be positive, got fx = {K[0, 0]:g}, fy = {K[1, 1]:g}")
+        if not (K[[0, 1], [0, 1]].min() > 0.1 and np.abs(K).max() < 1e6):
+            raise CameraError(f"K: focal lengths and centre must be in pixels (0.1 to 1e6), got {K[:2].tolist()}")
         if abs(K[0, 1]) > 1e-9 or np.abs(K[[1, 2, 2], [0, 0, 1]]).max() > 1e-9 or abs(K[2, 2] - 1) > 1e-9:
             raise CameraError("K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
-        if self.distortion_model not in DISTORTION_MODELS:
+        if not isinstance(self.distortion_model, str) or self.distortion_model not in DISTORTION_MODELS:
             raise CameraError(f"distortion_model {self.distortion_model!r}: must be {one_of(DISTORTION_MODELS)}")
         n = DISTORTION_MODELS[self.distortion_model]
         if len(coefficients) != n or not np.isfinite(coefficients).all():
@@ -59,6 +65,8 @@ class Camera:
                 f"distortion: {self.distortion_model} needs {n} finite coefficients, got {list(coefficients)}"
             )
         K.setflags(write=False)
+        object.__setattr__(self, "width", width)
+        object.__setattr__(self, "height", height)
         object.__setattr__(self, "K", K)
         object.__setattr__(self, "distortion", coefficients)
 
@@ -279,15 +287,28 @@ class RGBDCamera:
     """True: the depth image is already in the colour camera's pixels, up to a uniform scale"""
 
     def __post_init__(self) -> None:
-        T = np.asarray(self.T_color_depth, dtype=np.float64)
-        if T.shape != (4, 4) or not is_rigid(T):
-            raise CameraError("T_color_depth must be a 4x4 rigid transform (orthonormal rotation, last row 0 0 0 1)")
+        T = np.array(self.T_color_depth, dtype=np.float64)  # a copy
+        if T.shape != (4, 4) or not is_rigid(T) or np.abs(T).max() > 1e3:
+            raise CameraError(
+                "T_color_depth must be a 4x4 rigid transform (orthonormal rotation, metres, last row 0 0 0 1)"
+            )
         T.setflags(write=False)
         object.__setattr__(self, "T_color_depth", T)
         if self.registered:
+            if self.color.distorted and not self.depth.distorted:  # its pixels are the colour camera's
+                model, lens = self.color.distortion_model, self.color.distortion
+                object.__setattr__(self, "depth", replace(self.depth, distortion_model=model, distortion=lens))
             check_registered(self.color, self.depth)
             if np.abs(T - np.eye(4)).max() > 1e-6:
                 raise CameraError("T_color_depth must be the identity when depth.registered is true")
+
+    def to_json(self) -> dict[str, Any]:
+        """Both cameras and where they are to each other, as numbers."""
+        return {
+            "color": self.color.to_json(),
+            "depth": {**self.depth.to_json(), "registered": self.registered},
+            "T_color_depth": self.T_color_depth.tolist(),
+        }
 
     @classmethod
     def aligned(cls, camera: Camera) -> RGBDCamera:
@@ -301,10 +322,14 @@ def check_registered(color: Camera, depth: Camera) -> None:
     ratio = (depth.width / color.width) / (depth.height / color.height)
     tolerance = np.array([0.005 * ideal.fx, 0.005 * ideal.fy, 1.0, 1.0])
     difference = np.abs([depth.fx - ideal.fx, depth.fy - ideal.fy, depth.cx - ideal.cx, depth.cy - ideal.cy])
-    if abs(ratio - 1) > 0.01 or (difference > tolerance).any() or depth.distortion_model != color.distortion_model:
+    if abs(ratio - 1) > 0.01 or (difference > tolerance).any():
         raise CameraError(
-            "depth.registered is true, so depth's K must be color's K scaled uniformly and its distortion the same: "
-            f"expected about fx {ideal.fx:.1f} fy {ideal.fy:.1f} cx {ideal.cx:.1f} cy {ideal.cy:.1f} "
-            f"at {depth.width} x {depth.height}; got "
-            f"fx {depth.fx:.1f} fy {depth.fy:.1f} cx {depth.cx:.1f} cy {depth.cy:.1f}"
+            "depth.registered is true, so depth's K must be color's K scaled uniformly: expected about "
+            f"fx {ideal.fx:.1f} fy {ideal.fy:.1f} cx {ideal.cx:.1f} cy {ideal.cy:.1f}, "
+            f"got fx {depth.fx:.1f} fy {depth.fy:.1f} cx {depth.cx:.1f} cy {depth.cy:.1f}"
+        )
+    if np.abs(np.subtract(color._k, depth._k)).max() > 1e-6:
+        raise CameraError(
+            "depth.registered is true, so depth's distortion must be color's "
+            f"({list(color.distortion)}) or none, got {list(depth.distortion)}"
         )

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -21,16 +23,26 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Runs a command. Returns the exit status: 0 done, 1 nothing could be estimated, 2 wrong input, 130 interrupted."""
     arguments = _parser().parse_args(argv)
     try:
-        return int(arguments.run(arguments) or 0)
+        with warnings.catch_warnings():
+            warnings.showwarning = _note
+            return int(arguments.run(arguments) or 0)
     except (UnderstudyError, MissingExtraError) as e:
         print(f"understudy: error: {e}", file=sys.stderr)
         return 2
+    except BrokenPipeError:  # the reader of our output has gone, as in `understudy info sample | head -1`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 141
     except OSError as e:
         print(f"understudy: error: {e.filename or ''}: {e.strerror or e}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        print("\nunderstudy: interrupted; the same command goes on where it stopped", file=sys.stderr)
+        print(f"\nunderstudy: interrupted{arguments.after_interrupt}", file=sys.stderr)
         return 130
+
+
+def _note(message: Warning | str, category: type[Warning], *where: object, **more: object) -> None:
+    """Warnings are for the reader of the command's output, who does not know our source files."""
+    print(f"understudy: note: {message}", file=sys.stderr)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -40,6 +52,7 @@ def _parser() -> argparse.ArgumentParser:
         epilog="Start with: understudy estimate sample --out result && understudy view result",
     )
     parser.add_argument("--version", action="version", version=f"understudy {__version__}")
+    parser.set_defaults(after_interrupt="")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for add in (_add_estimate, _add_view, _add_info, _add_models, _add_benchmark):
         add(commands)
@@ -67,7 +80,7 @@ def _add_recording(parser: argparse.ArgumentParser) -> None:
     pair.add_argument("--color", metavar="FILE", type=Path, help="8-bit colour image")
     pair.add_argument("--depth", metavar="FILE", type=Path, help="16-bit depth image in the colour image's pixels")
     pair.add_argument("--intrinsics", nargs=4, type=float, metavar=("FX", "FY", "CX", "CY"), help="of the colour image")
-    pair.add_argument("--unit", type=float, default=0.001, metavar="M", help="metres per depth value (default 0.001)")
+    pair.add_argument("--unit", type=float, metavar="M", help="metres per depth value (default 0.001)")
 
 
 def _open(arguments: argparse.Namespace) -> Recording:
@@ -75,15 +88,21 @@ def _open(arguments: argparse.Namespace) -> Recording:
     from understudy import recordings
 
     pair = {"--color": arguments.color, "--depth": arguments.depth, "--intrinsics": arguments.intrinsics}
-    given = [name for name, value in pair.items() if value is not None]
+    given = [name for name, value in {**pair, "--unit": arguments.unit}.items() if value is not None]
     if arguments.recording is not None:
         if given:
-            raise UnderstudyError(f"give either RECORDING or {', '.join(pair)}, not both (got {given[0]})")
+            raise UnderstudyError(f"{given[0]} goes with a pair of images: give either RECORDING or {', '.join(pair)}")
         return recordings.open(arguments.recording)
+    given = [name for name in given if name in pair]
     if len(given) < len(pair):
         missing = [name for name in pair if name not in given]
         raise UnderstudyError(f"give RECORDING, or {_PAIR.split(',')[0]} ({', '.join(missing)} missing)")
-    return recordings.open_pair(arguments.color, arguments.depth, arguments.intrinsics, unit_m=arguments.unit)
+    return recordings.open_pair(
+        arguments.color,
+        arguments.depth,
+        arguments.intrinsics,
+        unit_m=0.001 if arguments.unit is None else arguments.unit,
+    )
 
 
 # --- estimate ---
@@ -115,17 +134,14 @@ def _add_estimate(commands: argparse._SubParsersAction) -> None:
     )
     parser.add_argument("--no-overlays", action="store_true", help="do not draw a picture per frame")
     parser.add_argument("--restart", action="store_true", help="begin anew instead of going on")
-    parser.set_defaults(run=_estimate)
+    parser.set_defaults(run=_estimate, after_interrupt="; the same command goes on where it stopped")
 
 
 def _estimate(arguments: argparse.Namespace) -> int:
     from understudy.pipeline import OVERLAYS, PEOPLE, estimate_recording
 
-    recording = _open(arguments)
-    if arguments.recording is None:
-        recording = _kept_pair(recording, arguments.out / "recording", arguments.unit)
     result = estimate_recording(
-        recording,
+        _open(arguments),
         arguments.out,
         method=arguments.method,
         detector=arguments.detector,
@@ -149,14 +165,6 @@ def _estimate(arguments: argparse.Namespace) -> int:
         print(f"  {pictures[0]}" + (f" ... {pictures[-1].name}" if len(pictures) > 1 else ""))
     print(f"Look at it in 3D: understudy view {arguments.out}")
     return 1 if len(skipped) == len(result.frames) else 0
-
-
-def _kept_pair(pair: Recording, folder: Path, unit_m: float) -> Recording:
-    """The pair as a recording folder inside the results, so that they can be viewed later."""
-    from understudy import recordings
-
-    recordings.write_recording(folder, pair, unit_m=unit_m, color_format="png", overwrite=True)
-    return recordings.open(folder)
 
 
 # --- view ---
@@ -235,7 +243,7 @@ def _models(arguments: argparse.Namespace) -> int:
     from understudy import assets
 
     if arguments.action == "fetch":
-        missing = [name for name in assets.MODELS if not assets.is_cached(name)]
+        missing = [name for name in assets.MODELS if assets.state(name) != "ready"]
         if missing or arguments.wheel:
             assets.fetch(wheel=arguments.wheel, progress=assets.progress_bar())
     elif arguments.wheel:
@@ -266,15 +274,16 @@ def _add_benchmark(commands: argparse._SubParsersAction) -> None:
     parser.add_argument("--methods", nargs="+", default=["naive"], metavar="METHOD", help="default: naive")
     parser.add_argument("--detector", default="blazepose", metavar="NAME", help="as in `understudy estimate`")
     parser.add_argument("--out", type=Path, default=Path("benchmark"), metavar="DIR", help="default: benchmark")
+    parser.add_argument("--resume", action="store_true", help="keep what an earlier run has estimated")
     parser.add_argument("--no-plots", action="store_true", help="tables only")
-    parser.set_defaults(run=_benchmark)
+    parser.set_defaults(run=_benchmark, after_interrupt="; with --resume the same command goes on where it stopped")
 
 
 def _benchmark(arguments: argparse.Namespace) -> None:
     from understudy import recordings
-    from understudy.benchmark import benchmark
+    from understudy.benchmark import PLOTS, TABLES, benchmark
+    from understudy.benchmark.estimates import estimate_into
     from understudy.estimator import METHODS
-    from understudy.pipeline import benchmark_estimate
 
     for method in arguments.methods:
         if method not in METHODS:
@@ -283,13 +292,13 @@ def _benchmark(arguments: argparse.Namespace) -> None:
         [recordings.open(path) for path in arguments.recordings],
         arguments.methods,
         arguments.out,
-        benchmark_estimate(arguments.out, arguments.detector),
+        estimate_into(arguments.out, arguments.detector, resume=arguments.resume, progress=True),
         plots=not arguments.no_plots,
         progress=lambda message: print(message, file=sys.stderr),
     )
     print(result.table())
-    for path in sorted(arguments.out.glob("*.*")):
-        print(f"  {path}")
+    for name in (*TABLES, *(() if arguments.no_plots else PLOTS)):
+        print(f"  {arguments.out / name}")
 
 
 if __name__ == "__main__":

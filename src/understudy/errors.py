@@ -31,7 +31,9 @@ class MissingExtraError(ImportError):
     """A feature needs an optional dependency that is not installed."""
 
     def __init__(self, feature: str, extra: str):
-        super().__init__(f"{feature} needs an optional part. Install it with: pip install 'understudy[{extra}]'")
+        super().__init__(
+            f"{feature}: an optional part is not installed. Install it with: pip install 'understudy[{extra}]'"
+        )
 
 
 def one_of(choices: Iterable[str]) -> str:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sized
 
 from understudy.camera import Camera
-from understudy.errors import FrameError
+from understudy.errors import FrameError, RecordingError
 from understudy.recordings.base import Recording
 
 
@@ -27,10 +28,17 @@ def describe(recording: Recording) -> str:
     else:
         x, y, z = camera.T_color_depth[:3, 3] * 1000
         lines.append(f"  registered  no: depth camera at ({x:.1f}, {y:.1f}, {z:.1f}) mm in the colour camera's frame")
-    truth, keypoints = recording.truth, recording.keypoints2d
-    lines.append("  truth       " + ("none" if truth is None else f"{len(truth.frames)} frames"))
-    lines.append("  keypoints2d " + ("none" if keypoints is None else f"{len(keypoints)} frames"))
+    lines.append("  truth       " + _frames(lambda: None if (truth := recording.truth) is None else truth.frames))
+    lines.append("  keypoints2d " + _frames(lambda: recording.keypoints2d))
     return "\n".join(lines)
+
+
+def _frames(read: Callable[[], Sized | None]) -> str:
+    try:
+        frames = read()
+    except RecordingError as e:
+        return f"cannot be read: {e}"
+    return "none" if frames is None else f"{len(frames)} frames"
 
 
 def check(recording: Recording, progress: bool = False) -> list[tuple[int, FrameError]]:

@@ -11,8 +11,8 @@ from jaxtyping import Float, Float32
 from scipy.special import gammainc
 
 from understudy.camera import Camera
-from understudy.skeleton import JOINTS
-from understudy.types import MISSING, OBSERVED, Keypoints2D, Person, RegisteredDepth, RegisteredFrame
+from understudy.skeleton import JOINTS, TORSO, rows
+from understudy.types import INFERRED, MISSING, OBSERVED, Keypoints2D, Person, RegisteredDepth, RegisteredFrame
 
 NEAREST = 3
 """valid depths whose median is taken (the paper's naive lifting)"""
@@ -23,6 +23,11 @@ RADIUS = 0.02
 _JOINT_DEPTH = {"neck": 0.06, "shoulder": 0.065, "elbow": 0.04, "wrist": 0.03, "hip": 0.11, "knee": 0.05, "ankle": 0.04}
 _SURFACE_TO_JOINT = np.array([_JOINT_DEPTH.get(name.split("_")[-1], 0.02) for name in JOINTS])
 _SIGMA_2D = 0.004  # of a 2D keypoint, in image widths
+# Metres that a joint can lie before or behind the torso; further away it is something else that was measured.
+_REACH = {"neck": 0.35, "shoulder": 0.35, "hip": 0.35, "elbow": 0.55, "wrist": 0.8, "knee": 0.65, "ankle": 0.95}
+_REACH_OF_JOINT = np.array([_REACH.get(name.split("_")[-1], 0.4) for name in JOINTS])
+_SHOULDERS = rows("right_shoulder", "left_shoulder")
+_SHOULDER_WIDTH = 0.33  # metres between the joints of an adult
 
 
 @runtime_checkable
@@ -38,7 +43,9 @@ class NaiveLifter:
     """The paper's baseline (section IV, "naive lifting"): each 2D keypoint, back-projected at the depth under it.
 
     The depth is the median of the 3 valid values nearest to the keypoint. A joint without a 2D keypoint, or without 3
-    valid depths within `RADIUS`, has no position. Nothing is inferred: a hidden joint lands on what hides it.
+    valid depths within `RADIUS`, has no position. A hidden joint lands on what hides it: the position stays the
+    paper's, but where no body could reach from the torso to that depth, `source` is inferred and sigma large. Sigma
+    also grows for shoulders that come out too narrow.
     """
 
     def __init__(self, min_score: float = 0.2):
@@ -62,6 +69,9 @@ class NaiveLifter:
         lifted = np.isfinite(keypoints).all(1)
         if not lifted.any():
             return Person.failure(seen, "no depth near any of the 2D keypoints")
+        beyond = _beyond_reach(seen, keypoints)
+        sigma = np.hypot(sigma, beyond)
+        sigma[_SHOULDERS] = np.hypot(sigma[_SHOULDERS], _missing_width(keypoints))
         # 10 cm in units of an isotropic Gaussian's sigma -> probability (chi distribution, 3 degrees of freedom)
         within = gammainc(1.5, np.where(lifted, 0.1 / np.where(lifted, sigma, 1), 0) ** 2 / 2)
         return Person(
@@ -69,7 +79,7 @@ class NaiveLifter:
             keypoints=np.where(lifted[:, None], keypoints, np.nan),
             confidence=seen.score * within,
             sigma_m=np.where(lifted, sigma, np.nan),
-            source=tuple(OBSERVED if ok else MISSING for ok in lifted),
+            source=tuple(np.where(lifted, np.where(beyond > 0, INFERRED, OBSERVED), MISSING).tolist()),
         )
 
 
@@ -83,6 +93,23 @@ def _sigma(z: np.ndarray, spread: np.ndarray, camera: Camera) -> np.ndarray:
     """
     across = _SIGMA_2D * camera.width / camera.fx * z
     return np.sqrt((_SURFACE_TO_JOINT**2 + spread**2 + 2 * across**2) / 3)
+
+
+def _beyond_reach(seen: Keypoints2D, keypoints: np.ndarray) -> Float[np.ndarray, "18"]:
+    """How far (metres) each joint's depth is from the torso's, where that is more than a body allows; else 0."""
+    torso = keypoints[TORSO, 2]
+    if seen.torso_z is None and not np.isfinite(torso).any():
+        return np.zeros(len(keypoints))
+    torso_z = float(np.nanmedian(torso)) if seen.torso_z is None else seen.torso_z
+    away = np.abs(np.nan_to_num(keypoints[:, 2], nan=torso_z) - torso_z)
+    return np.where(away > _REACH_OF_JOINT, away, 0.0)
+
+
+def _missing_width(keypoints: np.ndarray) -> float:
+    """What the shoulders lack (metres) of an adult's width: from the side, the far one is lifted to the near side."""
+    right, left = keypoints[_SHOULDERS]
+    width = float(np.linalg.norm(right - left))
+    return max(0.0, _SHOULDER_WIDTH - width) / np.sqrt(3) if np.isfinite(width) else 0.0
 
 
 def nearest_depths(
@@ -111,12 +138,12 @@ def _nearest_within(z: np.ndarray, center: np.ndarray, k: int, reach: float) -> 
     """`nearest_depths` in depth pixels, with NaN for values beyond `reach` pixels."""
     r = int(np.ceil(reach)) + 1
     offset = np.arange(-r, r + 1)
-    columns = np.rint(center[:, :1]).astype(np.int64) + offset
-    rows = np.rint(center[:, 1:]).astype(np.int64) + offset
+    column = np.rint(center[:, :1]).astype(np.int64) + offset
+    row = np.rint(center[:, 1:]).astype(np.int64) + offset
     h, w = z.shape
-    values = z[rows.clip(0, h - 1)[:, :, None], columns.clip(0, w - 1)[:, None, :]]
-    distance2 = (rows - center[:, 1:])[:, :, None] ** 2 + (columns - center[:, :1])[:, None, :] ** 2
-    inside = ((rows >= 0) & (rows < h))[:, :, None] & ((columns >= 0) & (columns < w))[:, None, :]
+    values = z[row.clip(0, h - 1)[:, :, None], column.clip(0, w - 1)[:, None, :]]
+    distance2 = (row - center[:, 1:])[:, :, None] ** 2 + (column - center[:, :1])[:, None, :] ** 2
+    inside = ((row >= 0) & (row < h))[:, :, None] & ((column >= 0) & (column < w))[:, None, :]
     distance2[~(inside & (values > 0) & (distance2 <= reach**2))] = np.inf
     values, distance2 = values.reshape(len(center), -1), distance2.reshape(len(center), -1)
     if values.shape[1] < k:

@@ -78,11 +78,16 @@ def frame_from_json(data: Any, where: str) -> FramePeople:
     people = data.get("people")
     if not isinstance(people, list):
         raise RecordingError(f"{where}: field 'people' must be a list")
+    timestamp, skipped = data.get("timestamp_s"), data.get("skipped")
+    if timestamp is not None and (isinstance(timestamp, bool) or not isinstance(timestamp, int | float)):
+        raise RecordingError(f"{where}.timestamp_s: must be a number, got {timestamp!r}")
+    if skipped is not None and not isinstance(skipped, str):
+        raise RecordingError(f"{where}.skipped: must be a text, got {skipped!r}")
     return FramePeople(
         data["index"],
         tuple(_person_from_json(p, f"{where}.people[{i}]") for i, p in enumerate(people)),
-        data.get("timestamp_s"),
-        data.get("skipped"),
+        timestamp,
+        skipped,
     )
 
 
@@ -111,17 +116,20 @@ def _person_to_json(person: Person) -> dict[str, Any]:
 def _person_from_json(data: Any, where: str) -> Person:
     if not isinstance(data, Mapping):
         raise RecordingError(f"{where}: must be an object")
-    keypoints_2d = Keypoints2D.from_rows(rows_from_json(data.get("keypoints_2d"), 3, f"{where}.keypoints_2d"))
+    rows = np.nan_to_num(rows_from_json(data.get("keypoints_2d"), 3, f"{where}.keypoints_2d"))
+    keypoints_2d = Keypoints2D.from_rows(rows)
     id = data.get("id", 0)
+    if not isinstance(id, int) or isinstance(id, bool) or id < 0:
+        raise RecordingError(f"{where}.id: must be a whole number, got {id!r}")
+    palms = data.get("hands") or {}
+    if not isinstance(palms, Mapping):
+        raise RecordingError(f"{where}.hands: must be an object")
     if "failed" in data:
         return Person.failure(keypoints_2d, str(data["failed"])).with_id(id)
     source = data.get("source")
     if not isinstance(source, list) or len(source) != N_JOINTS or not set(source) <= {OBSERVED, INFERRED, MISSING}:
         raise RecordingError(f"{where}.source: must be 18 of {OBSERVED}, {INFERRED}, {MISSING}")
-    hands = {
-        side: _palm_from_json((data.get("hands") or {}).get(side), f"{where}.hands.{side}")
-        for side in ("left", "right")
-    }
+    hands = {side: _palm_from_json(palms.get(side), f"{where}.hands.{side}") for side in ("left", "right")}
     return Person(
         keypoints_2d,
         rows_from_json(data.get("keypoints"), 3, f"{where}.keypoints"),

@@ -1,52 +1,64 @@
 """A whole recording -> a folder of results. Resumes where it stopped; one broken frame does not stop it.
 
-OUT/people.json          people of every frame (docs/people.md)
-OUT/config.json          what made it: recording, method, detector, version
-OUT/overlays/000000.png  the skeletons on colour and depth, one picture per frame
-OUT/people.jsonl         only while unfinished: one line per finished frame
+    OUT/people.json          people of every frame (docs/people.md)
+    OUT/overlays/000000.png  the skeletons on colour and depth, one picture per frame
+    OUT/config.json          what made it: recording and its cameras, method, detector, version
+    OUT/journal.jsonl        one line per finished frame, and which files it was made from: what a later run builds on
+    OUT/pair/                only for a pair of images: the pair, as a recording folder
+
+Ids are given anew over the whole recording each time, from the journal, so that a frame that was mended between two
+runs fits in.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
-import os
+import re
 import time
+import warnings
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import cv2
-import numpy as np
 
 import understudy
 from understudy import detectors
-from understudy.benchmark import Timed
 from understudy.errors import DetectorError, FrameError, RecordingError
 from understudy.estimator import Estimator
-from understudy.files import read_json, write_atomically
+from understudy.files import parse_json, read_json, write_atomically
 from understudy.overlay import draw_frame
 from understudy.people_file import FramePeople, PeopleFile, frame_from_json, frame_to_json
+from understudy.recordings import open as open_recording
+from understudy.recordings import write_recording
 from understudy.recordings.base import Recording
+from understudy.recordings.pair import PairRecording
 from understudy.tracking import IdentityTracker
-from understudy.types import Frame, Person
+from understudy.types import RegisteredFrame
 
-PEOPLE, CONFIG, OVERLAYS, JOURNAL = "people.json", "config.json", "overlays", "people.jsonl"
+PEOPLE, CONFIG, OVERLAYS, JOURNAL, PAIR = "people.json", "config.json", "overlays", "journal.jsonl", "pair"
+CONFIG_FORMAT = "estimate-config/1"
+
+Report = Callable[[FramePeople, float], object]
+"""Called with each frame that was estimated, and the seconds that its estimation took."""
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What decides the results; saved beside them. A resumed run must have the same."""
+    """What decides the results; saved beside them as config.json. A resumed run must have the same."""
 
     recording: str
     """absolute path"""
+    cameras: dict[str, Any]
     method: str
     detector: str
+    detector_input: str
+    """which files a detector reads its keypoints from; empty for others"""
     min_score: float
     version: str = understudy.__version__
-
-    def to_json(self) -> dict[str, Any]:
-        return {"format": "estimate-config/1", **self.__dict__}
+    format: str = CONFIG_FORMAT
 
 
 def estimate_recording(
@@ -59,137 +71,209 @@ def estimate_recording(
     overlays: bool = True,
     restart: bool = False,
     progress: bool = False,
+    report: Report = lambda frame, seconds: None,
 ) -> PeopleFile:
     """Estimates every frame of a recording and writes the folder `out`.
 
-    An interrupted run goes on where it stopped when it is started again with the same settings; `restart` begins anew.
-    A frame that cannot be read is listed with `skipped` and the reason. `overlays`: also a picture per frame.
-    Raises RecordingError when `out` holds results of other settings.
+    An interrupted run goes on where it stopped when it is started again with the same settings; frames whose images
+    have changed since are estimated again; `restart` begins anew. A frame that cannot be read is listed with `skipped`
+    and the reason. `overlays`: also a picture per frame. `progress`: a bar on stderr.
+    Raises RecordingError when `out` holds results of other settings, or something that is not ours.
     """
     out = Path(out)
-    settings = Settings(str(recording.path.resolve()), method, detector, min_score)
     estimator = Estimator(method, detectors.create(detector, recording), min_score)
-    done = _prepare(out, settings, restart)
-    run = _Run(recording, out, estimator, overlays, done)
+    source = (out / PAIR).resolve() if isinstance(recording, PairRecording) else recording.path.resolve()
+    reads = _detector_input(recording, detector)
+    settings = Settings(str(source), recording.camera.to_json(), method, detector, reads, min_score)
+    _prepare(out, settings, restart)
+    name = recording.name
+    if isinstance(recording, PairRecording):
+        recording = _kept(recording, out / PAIR)
+    run = _Run(recording, out, estimator, overlays, _read_journal(out / JOURNAL), report)
     try:
-        for _ in _bar(run.remaining(), len(recording), len(done), progress):
+        for _ in _bar(run, len(recording), progress):
             pass
     finally:  # also when interrupted: what is done can be looked at
-        result = PeopleFile(method, recording.name, tuple(run.done[i] for i in recording.indices if i in run.done))
+        result = PeopleFile(method, name, tuple(run.results))
         result.write(out / PEOPLE)
-    (out / JOURNAL).unlink(missing_ok=True)
     return result
 
 
+def _detector_input(recording: Recording, detector: str) -> str:
+    """A word that changes when the files change from which a detector reads precomputed keypoints."""
+    kind, _, argument = detector.partition(":")
+    if kind == "recording":
+        return signature([recording.path / "keypoints2d.json"])
+    if kind == "openpose-json":
+        folder = Path(argument if Path(argument).is_dir() else argument.rpartition(":")[0])
+        return f"{folder.resolve()}: {signature(sorted(folder.glob('*.json')))}"
+    return ""
+
+
+def signature(files: list[Path] | tuple[Path, ...]) -> str:
+    """A word that changes when files are replaced, edited or removed: from their names, sizes and times."""
+    parts = []
+    for path in files:
+        try:
+            state = path.stat()
+            parts.append(f"{path.name}:{state.st_size}:{state.st_mtime_ns}")
+        except OSError:
+            parts.append(f"{path.name}:missing")
+    return hashlib.sha256("|".join(parts).encode()).hexdigest()[:16]
+
+
+def _kept(pair: PairRecording, folder: Path) -> Recording:
+    """The pair as a recording folder beside its results, so that they can be viewed later."""
+    state = folder / "sources.txt"
+    now = signature(pair.sources(0))
+    if not (state.exists() and state.read_text() == now):
+        write_recording(folder, pair, unit_m=pair.unit_m, color_format="png", overwrite=True)
+        write_atomically(state, now)
+    return open_recording(folder)
+
+
+@dataclass(frozen=True)
+class _Done:
+    """A line of the journal."""
+
+    frame: FramePeople
+    made_from: str
+
+
 class _Run:
-    """The frames that are still to do, one after the other."""
+    """All frames, one after the other: estimated, or taken from the journal."""
 
     def __init__(
-        self, recording: Recording, out: Path, estimator: Estimator, overlays: bool, done: dict[int, FramePeople]
+        self,
+        recording: Recording,
+        out: Path,
+        estimator: Estimator,
+        overlays: bool,
+        journal: dict[int, _Done],
+        report: Report,
     ):
         self.recording, self.out, self.estimator, self.overlays = recording, out, estimator, overlays
-        self.done = done
+        self.results: list[FramePeople] = []
+        self._journal, self._report = journal, report
         self._tracker = IdentityTracker()
+        vanished = journal.keys() - set(recording.indices)
+        if vanished:
+            warnings.warn(f"{len(vanished)} frames are no longer in {recording.path}: left out", stacklevel=3)
 
-    def remaining(self) -> Iterator[FramePeople]:
-        """Estimates what is missing, in order; each result is on disk before the next begins."""
+    def __iter__(self) -> Iterator[FramePeople]:
+        """Each result is on disk before the next begins."""
         with (self.out / JOURNAL).open("a", encoding="utf-8") as journal:
             for position, index in enumerate(self.recording.indices):
-                if index in self.done:
-                    self._tracker.remember(self.done[index].people)
-                    continue
-                result = self._frame(position, index)
-                journal.write(json.dumps(frame_to_json(result), allow_nan=False) + "\n")
-                journal.flush()
-                self.done[index] = result
-                yield result
+                made_from = signature(self.recording.sources(position))
+                done = self._journal.get(index)
+                known = done is not None and done.made_from == made_from and done.frame.skipped is None
+                frame = self._taken_over(done.frame, position) if known and done else self._estimated(position)
+                if done is None or frame is not done.frame:
+                    line = {"made_from": made_from, **frame_to_json(frame)}
+                    journal.write(json.dumps(line, allow_nan=False) + "\n")
+                    journal.flush()
+                self.results.append(frame)
+                yield frame
 
-    def _frame(self, position: int, index: int) -> FramePeople:
-        times = self.recording.timestamps_s
-        timestamp = None if times is None else times[position]
+    def _taken_over(self, done: FramePeople, position: int) -> FramePeople:
+        """A finished frame; drawn again only if its picture is missing or its people have got other ids."""
+        frame = self._numbered(done)
+        renamed = [p.id for p in frame.people] != [p.id for p in done.people] or any(
+            p.keypoints_2d is not q.keypoints_2d for p, q in zip(frame.people, done.people, strict=True)
+        )
+        if self.overlays and (renamed or not self._picture(frame.index).exists()):
+            self._draw(self.estimator.register(self.recording[position]), frame)
+        return frame if renamed else done
+
+    def _estimated(self, position: int) -> FramePeople:
+        index, times = self.recording.indices[position], self.recording.timestamps_s
+        frame = FramePeople(index, (), None if times is None else times[position])
+        start = time.perf_counter()
         try:
-            people = self._people(self.recording[position])
+            registered = self.estimator.register(self.recording[position])
+            people = self.estimator.estimate(registered)
         except (FrameError, DetectorError) as error:
-            return FramePeople(index, (), timestamp, skipped=str(error))
-        return FramePeople(index, tuple(people), timestamp)
-
-    def _people(self, frame: Frame) -> list[Person]:
-        registered = self.estimator.register(frame)
-        people = sorted(self._tracker.update(self.estimator.estimate(registered)), key=lambda person: person.id)
+            self._picture(index).unlink(missing_ok=True)
+            return replace(frame, skipped=str(error))
+        frame = self._numbered(replace(frame, people=tuple(people)))
+        self._report(frame, time.perf_counter() - start)
         if self.overlays:
-            write_png(self.out / OVERLAYS / f"{frame.index:06d}.png", draw_frame(registered, people))
-        return people
+            self._draw(registered, frame)
+        return frame
+
+    def _numbered(self, frame: FramePeople) -> FramePeople:
+        """With ids that stay with people, in their order."""
+        people = self._tracker.update(frame.people)
+        return replace(frame, people=tuple(sorted(people, key=lambda person: person.id)))
+
+    def _picture(self, index: int) -> Path:
+        return self.out / OVERLAYS / f"{index:06d}.png"
+
+    def _draw(self, registered: RegisteredFrame, frame: FramePeople) -> None:
+        image = cv2.cvtColor(draw_frame(registered, frame.people), cv2.COLOR_RGB2BGR)
+        ok, data = cv2.imencode(".png", image)
+        assert ok
+        write_atomically(self._picture(frame.index), data.tobytes())
 
 
-def write_png(path: Path, image: np.ndarray) -> None:
-    """Writes an RGB image as PNG, whole or not at all."""
-    ok, data = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
-    assert ok
-    write_atomically(path, data.tobytes())
-
-
-def _prepare(out: Path, settings: Settings, restart: bool) -> dict[int, FramePeople]:
-    """Makes the folder; what an earlier run with the same settings has finished, by frame index."""
+def _prepare(out: Path, settings: Settings, restart: bool) -> None:
+    """Makes the folder, or makes sure that it holds results of the same settings (`restart`: of any)."""
     if out.exists() and not out.is_dir():
-        raise RecordingError(f"{out}: is a file; --out must name a folder")
-    if restart:
-        for name in (PEOPLE, JOURNAL, CONFIG):
+        raise RecordingError(f"{out}: is a file; the results need a folder")
+    ours = _is_ours(out)
+    if ours and restart:
+        for name in (PEOPLE, JOURNAL):
             (out / name).unlink(missing_ok=True)
-        for old in (out / OVERLAYS).glob("[0-9]*.png"):
-            old.unlink()
-    if (out / CONFIG).exists():
-        before, now = read_json(out / CONFIG), settings.to_json()
+        for old in (out / OVERLAYS).glob("*.png"):
+            if re.fullmatch(r"\d{6,}\.png", old.name):
+                old.unlink()
+    elif ours:
+        before, now = read_json(out / CONFIG), json.loads(json.dumps(asdict(settings)))
         different = [k for k in now if before.get(k) != now[k]]
         if different:
             k = different[0]
+            was = "" if isinstance(now[k], dict) else f": {before.get(k)!r} then, {now[k]!r} now"
             raise RecordingError(
-                f"{out}: holds results of other settings ({k} was {before.get(k)!r}, is {now[k]!r}). "
+                f"{out}: holds results of other settings ({k} differs{was}). "
                 "Choose another folder, or begin anew with --restart"
             )
-        return _finished(out)
-    if (out / PEOPLE).exists() or (out / JOURNAL).exists():
-        raise RecordingError(f"{out}: holds results without {CONFIG}. Choose another folder, or use --restart")
-    write_atomically(out / CONFIG, json.dumps(settings.to_json(), indent=1) + "\n")
-    return {}
+    write_atomically(out / CONFIG, json.dumps(asdict(settings), indent=1) + "\n")
 
 
-def _finished(out: Path) -> dict[int, FramePeople]:
-    done: dict[int, FramePeople] = {}
-    if (out / PEOPLE).exists():
-        done = {f.index: f for f in PeopleFile.read(out / PEOPLE).frames}
-    if (out / JOURNAL).exists():
-        lines = (out / JOURNAL).read_bytes().split(b"\n")
-        complete = lines[:-1]  # a line cut short by a crash has no end
-        for n, line in enumerate(complete, 1):
-            where = f"{out / JOURNAL}: line {n}"
-            try:
-                frame = frame_from_json(json.loads(line), where)
-            except ValueError as e:
-                raise RecordingError(f"{where}: damaged ({e}). Begin anew with --restart") from e
-            done[frame.index] = frame
-        if lines[-1]:
-            write_atomically(out / JOURNAL, b"\n".join([*complete, b""]))
-    return {i: f for i, f in done.items() if f.skipped is None}  # a broken frame gets another chance
+def _is_ours(out: Path) -> bool:
+    """Whether the folder holds results of ours; raises RecordingError if it holds files that would be in the way."""
+    if (out / CONFIG).exists() and read_json(out / CONFIG).get("format") == CONFIG_FORMAT:
+        return True
+    in_the_way = [name for name in (CONFIG, PEOPLE, JOURNAL, OVERLAYS, PAIR) if (out / name).exists()]
+    if in_the_way:
+        raise RecordingError(
+            f"{out}: holds {in_the_way[0]}, which `understudy estimate` did not write there. Choose another folder"
+        )
+    return False
 
 
-def _bar(frames: Iterator[FramePeople], total: int, done: int, show: bool) -> Iterator[FramePeople]:
+def _read_journal(path: Path) -> dict[int, _Done]:
+    """Finished frames by index; of several lines for a frame the last counts."""
+    if not path.exists():
+        return {}
+    *complete, rest = path.read_bytes().split(b"\n")
+    done: dict[int, _Done] = {}
+    for n, line in enumerate(complete, 1):
+        where = f"{path}: line {n}"
+        try:
+            data = parse_json(line, where)
+            frame = frame_from_json(data, where)
+        except RecordingError as e:
+            raise RecordingError(f"{e}. The journal is damaged; begin anew with --restart") from e
+        done[frame.index] = _Done(frame, str(data.get("made_from")))
+    if rest:  # a line cut short by a crash
+        write_atomically(path, b"\n".join([*complete, b""]))
+    return done
+
+
+def _bar(frames: _Run, total: int, show: bool) -> Iterator[FramePeople]:
     if not show:
-        return frames
+        return iter(frames)
     from tqdm import tqdm
 
-    quiet = os.environ.get("UNDERSTUDY_PROGRESS") == "0"
-    return iter(tqdm(frames, total=total, initial=done, unit="frame", desc="estimate", disable=quiet))
-
-
-def benchmark_estimate(out: Path, detector: str) -> Callable[[Any, str], Timed]:
-    """The `estimate` that `benchmark` calls: results go to OUT/RECORDING/METHOD, and an interrupted run goes on."""
-
-    def estimate(recording: Recording, method: str) -> Timed:
-        start = time.perf_counter()
-        folder = out / recording.name / method
-        fresh = not (folder / CONFIG).exists()
-        people = estimate_recording(recording, folder, method=method, detector=detector, overlays=False, progress=True)
-        ms = 1000 * (time.perf_counter() - start) / max(len(people.frames), 1)
-        return Timed(people, ms if fresh else None)
-
-    return estimate
+    return iter(tqdm(frames, total=total, unit="frame", desc="estimate"))

@@ -50,19 +50,6 @@ class IdentityTracker:
                 out[i] = self._start(person)
         return [p for p in out if p is not None]
 
-    def remember(self, people: Sequence[Person]) -> None:
-        """Takes over a frame that has its ids (when a recording is resumed)."""
-        for track in self._tracks:
-            track.age += 1
-        known = {t.id: t for t in self._tracks}
-        for person in people:
-            if person.id in known:
-                self._follow(known[person.id], person)
-            else:
-                self._tracks.append(_Track(person.id, person))
-                self._next = max(self._next, person.id + 1)
-        self._tracks = [t for t in self._tracks if t.age <= MEMORY]
-
     @staticmethod
     def _follow(track: _Track, person: Person) -> Person:
         track.person, track.age = person.with_id(track.id), 0

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
 from understudy.camera import Camera, RGBDCamera, check_registered
-from understudy.errors import FrameError
+from understudy.errors import FrameError, UnderstudyError
 from understudy.skeleton import N_JOINTS
 
 OBSERVED, INFERRED, MISSING = "observed", "inferred", "missing"
@@ -41,6 +41,10 @@ class Frame:
                 f"frame {self.index}: depth must be float32 metres of shape {(d.height, d.width)} as its camera says, "
                 f"got {self.depth.dtype} {self.depth.shape}"
             )
+        if self.timestamp_s is not None:
+            object.__setattr__(self, "timestamp_s", float(self.timestamp_s))
+            if not np.isfinite(self.timestamp_s):
+                raise FrameError(f"frame {self.index}: timestamp_s must be a finite number of seconds or None")
         if not np.isfinite(self.depth).all() or (self.depth.size and self.depth.min() < 0):
             raise FrameError(f"frame {self.index}: depth holds NaN, infinite or negative values; 'no measurement' is 0")
 
@@ -55,10 +59,10 @@ class RegisteredDepth:
     """the colour camera, resized to the depth image"""
 
     def __post_init__(self) -> None:
-        if self.z.shape != (self.camera.height, self.camera.width):
+        if self.z.dtype != np.float32 or self.z.shape != (self.camera.height, self.camera.width):
             raise FrameError(
-                f"registered depth of shape {self.z.shape} does not fit its camera "
-                f"({self.camera.height}, {self.camera.width})"
+                f"registered depth must be float32 metres of shape ({self.camera.height}, {self.camera.width}) as its "
+                f"camera says, got {self.z.dtype} {self.z.shape}"
             )
 
     def scale_to(self, color: Camera) -> float:
@@ -79,6 +83,11 @@ class RegisteredFrame:
     timestamp_s: float | None = None
 
     def __post_init__(self) -> None:
+        if self.color.dtype != np.uint8 or self.color.shape != (self.camera.height, self.camera.width, 3):
+            raise FrameError(
+                f"frame {self.index}: color must be 8-bit RGB of shape {(self.camera.height, self.camera.width, 3)} "
+                f"as its camera says, got {self.color.dtype} {self.color.shape}"
+            )
         check_registered(self.camera, self.depth.camera)
 
 
@@ -94,7 +103,13 @@ class Keypoints2D:
     """metres: depth of the person's torso surface, where the detector saw one"""
 
     def __post_init__(self) -> None:
-        assert self.uv.shape == (N_JOINTS, 2) and self.score.shape == (N_JOINTS,)
+        if self.uv.shape != (N_JOINTS, 2) or self.score.shape != (N_JOINTS,):
+            raise UnderstudyError(
+                "2D keypoints are uv of shape (18, 2) and score of shape (18,), "
+                f"got {self.uv.shape} and {self.score.shape}"
+            )
+        if not np.isfinite(self.uv).all() or not ((self.score >= 0) & (self.score <= 1)).all():
+            raise UnderstudyError("2D keypoints must be finite, and their scores in [0, 1]")
 
     @property
     def found(self) -> np.ndarray:
@@ -108,9 +123,12 @@ class Keypoints2D:
 
     @classmethod
     def where(cls, uv: np.ndarray, score: np.ndarray, torso_z: float | None = None) -> Keypoints2D:
-        """Keypoints with the position of those that have no score set to (0, 0)."""
-        score = np.clip(np.asarray(score, dtype=np.float64), 0.0, 1.0)
-        return cls(np.where(score[:, None] > 0, np.asarray(uv, dtype=np.float64), 0.0), score, torso_z)
+        """Keypoints from any numbers: scores are clipped to [0, 1]; a joint that has no score or no finite position
+        counts as not found.
+        """
+        finite = np.isfinite(uv).all(axis=1) & np.isfinite(score)
+        clipped = np.where(finite, np.clip(np.nan_to_num(score), 0.0, 1.0), 0.0).astype(np.float64)
+        return cls(np.where(clipped[:, None] > 0, uv, 0.0).astype(np.float64), clipped, torso_z)
 
     def rows(self) -> Float[np.ndarray, "18 3"]:
         """Rows (u, v, score)."""

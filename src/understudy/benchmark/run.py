@@ -47,6 +47,11 @@ class RecordingWithTruth(Protocol):
     def truth(self) -> Truth | None: ...
 
 
+TABLES = ("table.md", "table.csv", "results.json")
+PLOTS = ("pck.png", "joints.png", "calibration.png")
+"""Files that `BenchmarkResult.write` writes."""
+
+
 @dataclass(frozen=True, eq=False)
 class Timed:
     """People whose estimation was timed elsewhere, or (None) was not."""

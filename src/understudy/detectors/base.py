@@ -12,7 +12,7 @@ from understudy.types import Keypoints2D, RegisteredDepth
 
 @runtime_checkable
 class Detector(Protocol):
-    """Finds every person in a colour image. `tests/test_detectors.py` holds the contract that all back-ends pass."""
+    """Finds every person in a colour image. `tests/test_detectors.py` holds all back-ends to this contract."""
 
     name: str
 

@@ -12,7 +12,6 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from understudy.assets import model_path
-from understudy.camera import Camera
 from understudy.detectors.blazepose_nets import DETECTOR_SIZE, LANDMARK_SIZE, BlazePoseNets, Landmarks, Region
 from understudy.detectors.windows import Scene, windows
 from understudy.skeleton import FACE, JOINT, N_JOINTS, TORSO, to_coco18
@@ -35,6 +34,8 @@ class Candidate:
     """mid hip to mid shoulder, pixels"""
     group: int
     """index of the thing in the depth image, -1 if none"""
+    own_window: bool = False
+    """seen in the window around its thing, which shows it better than a tile does"""
 
 
 @dataclass(frozen=True)
@@ -114,8 +115,8 @@ class BlazePoseDetector:
                 group = -1 if scene is None else _group_between(scene, hip, shoulder)
                 if look.group is not None and group not in (-1, look.group):
                     continue  # somebody else, whose own window shows them better
-                bonus = 1.0 if look.group is not None else 0.0
-                out.append(Candidate(float(row[0]) + bonus, Region.from_points(hip, rim), hip, torso, group))
+                region, own = Region.from_points(hip, rim), look.group is not None
+                out.append(Candidate(float(row[0]), region, hip, torso, group, own))
         return out
 
     def _looks(
@@ -183,8 +184,8 @@ def _coco(landmarks: Landmarks, width: int, height: int) -> Float[np.ndarray, "1
     """COCO-18 rows (u, v, score); score 0 outside the image."""
     score = landmarks.visibility * landmarks.presence
     rows = to_coco18(np.column_stack([landmarks.uv, score]), "blazepose")
-    camera = Camera(width, height, np.eye(3))
-    rows[~camera.contains(rows[:, :2]), 2] = 0
+    inside = (rows[:, :2] >= -0.5) & (rows[:, :2] < (width - 0.5, height - 0.5))
+    rows[~inside.all(1), 2] = 0
     return rows
 
 
@@ -229,7 +230,7 @@ def _places(scene: Scene, group: int, torso_z: float | None, uv: Float[np.ndarra
 def distinct(candidates: list[Candidate]) -> list[Candidate]:
     """The best candidate of each person: best first, others dropped whose hips are close for their size."""
     out: list[Candidate] = []
-    for c in sorted(candidates, key=lambda c: -c.score):
+    for c in sorted(candidates, key=lambda c: (c.own_window, c.score), reverse=True):
         if not any(_same(c, kept) for kept in out):
             out.append(c)
     return out

@@ -66,10 +66,11 @@ class DepthGrid:
 
     @cached_property
     def points(self) -> Float32[np.ndarray, "gh gw 3"]:
-        """Cell centres in the colour camera's frame, metres; meaningless where z = 0."""
+        """Cell centres in the colour camera's frame, metres; 0 where z = 0 or the lens model has no ray."""
         gh, gw = self.z.shape
         u, v = np.meshgrid(np.arange(gw), np.arange(gh))
-        return self.camera.unproject(np.stack([u, v], -1).astype(np.float64), self.z).astype(np.float32)
+        points = self.camera.unproject(np.stack([u, v], -1).astype(np.float64), self.z).astype(np.float32)
+        return np.where(np.isfinite(points).all(-1, keepdims=True), points, 0)
 
     @cached_property
     def floor(self) -> Float[np.ndarray, "4"] | None:

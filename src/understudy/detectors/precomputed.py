@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -11,6 +10,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from understudy.errors import DetectorError, one_of
+from understudy.files import read_json
 from understudy.skeleton import LAYOUTS, to_coco18
 from understudy.types import Keypoints2D, RegisteredDepth
 
@@ -62,7 +62,7 @@ class OpenPoseJson:
     def detect(
         self, color: UInt8[np.ndarray, "h w 3"], depth: RegisteredDepth | None = None, index: int = 0
     ) -> list[Keypoints2D]:
-        """People of the file of frame `index`; nobody where there is no file (OpenPose writes one for every frame)."""
+        """People of the file of frame `index`. Raises DetectorError where there is none (OpenPose writes them all)."""
         path = self._files.get(index)
         if path is None:
             raise DetectorError(f"{self.folder}: no file for frame {index}")
@@ -97,13 +97,13 @@ class OpenPoseJson:
 def _read(path: Path) -> list[np.ndarray]:
     """The n x 3 keypoints of each person of one file."""
     try:
-        people = json.loads(path.read_text())["people"]
+        people = read_json(path)["people"]
         rows = [np.array(p["pose_keypoints_2d"], dtype=np.float64).reshape(-1, 3) for p in people]
-    except (OSError, UnicodeDecodeError, ValueError, KeyError, TypeError) as e:
+    except (ValueError, KeyError, TypeError) as e:
         raise DetectorError(
             f"{path}: not OpenPose's JSON (people[].pose_keypoints_2d, triples u v score): {e!r}"
         ) from e
     for r in rows:
-        if not np.isfinite(r).all():
-            raise DetectorError(f"{path}: pose_keypoints_2d holds values that are not finite")
+        if not np.isfinite(r).all():  # null
+            raise DetectorError(f"{path}: pose_keypoints_2d holds values that are not numbers")
     return [r for r in rows if (r[:, 2] > 0).any()]

@@ -2,7 +2,7 @@
 
 With depth: a window around each thing that could be a person, other such things greyed out of it; large tiles for
 people whom depth does not show; and, where things are joined to walls and furniture, tiles of about a person's size.
-Without depth: tiles of three sizes.
+Without depth: the whole image, and tiles of two sizes.
 """
 
 from __future__ import annotations
@@ -142,6 +142,7 @@ def tiles(width: int, height: int, sides: tuple[float, ...]) -> list[Region]:
 
 def _cover(left: float, top: float, right: float, bottom: float, side: float) -> list[Region]:
     """Squares that cover a box, overlapping by half or more; they reach beyond a box that is smaller than they are."""
+    side = max(side, max(right - left, bottom - top) / 8)  # at most 18 along an image, however long and thin
     spans = []
     for low, high in ((left, right), (top, bottom)):
         room = high - low - side

@@ -59,6 +59,10 @@ class Recording(ABC):
     def _read(self, position: int) -> tuple[UInt8[np.ndarray, "h w 3"], Float32[np.ndarray, "hd wd"]]:
         """Colour (RGB) and depth (metres) of the frame at a position. Raises FrameError that names the file."""
 
+    def sources(self, position: int) -> tuple[Path, ...]:
+        """The files that the frame at a position is read from; some may be missing."""
+        return (self.path,)
+
     @property
     def name(self) -> str:
         """The file's or folder's name."""

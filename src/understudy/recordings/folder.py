@@ -79,6 +79,10 @@ class FolderRecording(Recording):
         check_size(depth, self.camera.depth, depth_path, f"{INFO}: depth")
         return color, depth * np.float32(self._unit_m)
 
+    def sources(self, position: int) -> tuple[Path, ...]:
+        index = self.indices[position]
+        return (*self._color.get(index, ()), *self._depth.get(index, ()))
+
     @cached_property
     def truth(self) -> Truth | None:
         path = self.path / TRUTH
@@ -137,7 +141,8 @@ def _camera_from_json(data: dict[str, Any], info: Path) -> tuple[RGBDCamera, flo
                 raise CameraError(f"T_color_depth must be a 4x4 rigid transform, got shape {T_color_depth.shape}")
             return RGBDCamera(color, depth, T_color_depth, registered), float(unit_m)
     except (TypeError, ValueError, OverflowError) as e:
-        raise RecordingError(f"{info}: T_color_depth: {e}" if "T_color_depth" not in str(e) else f"{info}: {e}") from e
+        named = any(word in str(e) for word in ("T_color_depth", "depth."))
+        raise RecordingError(f"{info}: {e}" if named else f"{info}: T_color_depth: {e}") from e
 
 
 def _fps(value: Any, info: Path) -> float | None:

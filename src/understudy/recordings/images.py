@@ -81,6 +81,8 @@ def check_image(data: bytes, where: str) -> ImageHeader:
 
 def _bytes_of(path: Path) -> bytes:
     try:
+        if path.exists() and not path.is_file():  # reading a pipe would wait for ever
+            raise FrameError(f"{path}: not a file")
         return path.read_bytes()
     except FileNotFoundError as e:
         raise FrameError(f"{path}: no such file") from e

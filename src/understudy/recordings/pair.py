@@ -30,6 +30,14 @@ class PairRecording(Recording):
     def recognizes(cls, path: Path) -> bool:
         return False
 
+    @property
+    def unit_m(self) -> float:
+        """Metres per depth value."""
+        return self._unit_m
+
+    def sources(self, position: int) -> tuple[Path, ...]:
+        return self._color, self._depth
+
     def _read(self, position: int) -> tuple[UInt8[np.ndarray, "h w 3"], Float32[np.ndarray, "hd wd"]]:
         color, depth = read_color(self._color), read_depth(self._depth)
         check_size(color, self.camera.color, self._color, "its header, when it was opened,")

@@ -37,7 +37,7 @@ def checked_times(times: object, n_frames: int, where: str) -> tuple[float, ...]
         raise RecordingError(f"{where} must be a list of numbers (seconds)")
     if len(times) != n_frames:
         raise RecordingError(f"{where} must have one number per frame: {len(times)} numbers, {n_frames} frames")
-    if not np.isfinite(times).all():
+    if not np.isfinite(np.array(times, dtype=np.float64)).all():
         raise RecordingError(f"{where} must be finite")
     for i, (before, after) in enumerate(pairwise(times)):
         if not before < after:

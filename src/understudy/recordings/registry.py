@@ -35,7 +35,7 @@ def open(path: str | Path, **options: Any) -> Recording:  # shadows the builtin 
     `options` go to the format (for example `K` for a TUM sequence). Raises RecordingError if the path does not exist,
     is of no known format or cannot be read as a whole.
     """
-    place = sample_path() if path == SAMPLE else Path(path)
+    place = sample_path() if str(path) == SAMPLE else Path(path)
     try:
         exists = place.exists()
     except (OSError, ValueError) as e:  # names with a NUL, too long names

@@ -82,6 +82,10 @@ class TumRecording(Recording):
         check_size(depth, self.camera.depth, self._depth[j], "the first image's size")
         return color, depth * np.float32(self._unit_m)
 
+    def sources(self, position: int) -> tuple[Path, ...]:
+        i, j = self._pairs[position]
+        return self._color[i], self._depth[j]
+
 
 def _read_list(path: Path) -> tuple[np.ndarray, list[Path]]:
     """Times (seconds, ascending) and image files of rgb.txt or depth.txt. Raises RecordingError that names the line."""

@@ -71,6 +71,13 @@ class Results:
         if not people.frames:
             raise RecordingError(f"{path}: field 'frames' is empty, so there is nothing to view")
         opened = recordings.open(_recording_path(folder, recording))
+        made_with = read_json(folder / "config.json").get("cameras") if (folder / "config.json").is_file() else None
+        if made_with is not None and made_with != opened.camera.to_json():
+            opened.close()
+            raise RecordingError(
+                f"{path}: was made from a recording of other cameras than those of {opened.path}; "
+                "say which recording it was made from with --recording PATH"
+            )
         if not {f.index for f in people.frames} & set(opened.indices):
             opened.close()
             raise RecordingError(
