@@ -102,3 +102,15 @@ def test_not_a_wheel(small, tmp_path, content):
 def test_unknown_names():
     with pytest.raises(ModelFileError, match="must be one of 'pose_detection', 'pose_landmark_full'"):
         assets.model_path("pose")
+
+
+def test_fetch_command_mends_a_damaged_file(small, monkeypatch, capsys):
+    from understudy.cli import main
+
+    assets.fetch(wheel=small)
+    assets.MODELS["one"].path.write_bytes(b"damaged")
+    monkeypatch.setattr(assets, "_download", lambda *_: small)
+    assert main(["models"]) == 2
+    assert "damaged" in capsys.readouterr().out
+    assert main(["models", "fetch"]) == 0
+    assert assets.state("one") == "ready"

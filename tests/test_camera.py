@@ -295,3 +295,31 @@ def test_pairs_of_cameras():
     for depth in (color.crop(10, 0, 640, 480), color.resize(640, 240), Camera(640, 480, changed(0, 0, 520))):
         with pytest.raises(CameraError, match="K scaled uniformly"):
             check_registered(color, depth)
+
+
+def test_arrays_of_the_caller_stay_the_callers():
+    K = np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
+    T = np.eye(4)
+    camera = Camera(640, 480, K)
+    pair = RGBDCamera(camera, camera, T)
+    K[0, 0], T[0, 3] = 1, 1
+    assert camera.fx == 500 and pair.T_color_depth[0, 3] == 0
+    with pytest.raises(ValueError, match="read-only"):
+        camera.K[0, 0] = 3
+
+
+@pytest.mark.parametrize("f", [1e-200, 1e200])
+def test_absurd_focal_lengths(f):
+    with pytest.raises(CameraError, match="must be in pixels"):
+        Camera(640, 480, np.array([[f, 0, 320], [0, f, 240], [0, 0, 1]]))
+
+
+def test_registered_depth_has_the_lens_of_colour():
+    K = np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
+    color = Camera(640, 480, K, "brown_conrady", (0.1, 0, 0, 0, 0))
+    unsaid = RGBDCamera(color, Camera(640, 480, K), registered=True)
+    assert unsaid.depth.distortion == color.distortion
+    zeros = Camera(640, 480, K, "brown_conrady", (0.0,) * 5)
+    assert not RGBDCamera(Camera(640, 480, K), zeros, registered=True).depth.distorted
+    with pytest.raises(CameraError, match="distortion must be color's"):
+        RGBDCamera(color, Camera(640, 480, K, "brown_conrady", (-0.3, 0, 0, 0, 0)), registered=True)

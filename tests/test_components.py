@@ -113,3 +113,18 @@ def test_tiles_cover_the_image():
             x, y, half = *tile.center, tile.size / 2
             covered[max(0, round(y - half)) : round(y + half) + 1, max(0, round(x - half)) : round(x + half) + 1] = True
         assert covered.all()
+
+
+def test_cells_without_a_ray_do_no_harm(camera: Camera):
+    """A lens model that folds back before the corners, depth registered to it."""
+    folded = Camera(960, 540, camera.K, "brown_conrady", (-0.35, 0.0, 0.0, 0.0, 0.0))
+    z = room(camera, [(0.0, 3.0)])
+    grid = DepthGrid(RegisteredDepth(z, folded), folded)
+    assert np.isnan(folded.normalized(np.array([[0.0, 0.0]]))).all()
+    assert np.isfinite(grid.points).all()
+    boxes = [g.box for g in Scene(RegisteredDepth(z, folded), folded).groups if g.compact]
+    assert len(boxes) == 1 and np.isfinite(boxes).all()
+
+
+def test_tiles_of_thin_images_stay_few():
+    assert len(tiles(2, 2000, (1.0, 0.67))) < 60

@@ -103,3 +103,37 @@ def test_order_and_company_do_not_matter(flat_frame: Frame):
     for k, person in zip(seen, together, strict=True):
         np.testing.assert_array_equal(NaiveLifter().lift(registered, [k])[0].keypoints, person.keypoints)
     assert NaiveLifter().lift(registered, []) == []
+
+
+def test_a_joint_on_something_else_is_inferred(flat_frame: Frame):
+    """A knee measured on a table 0.9 m before the torso: the paper's position, but nobody is told to trust it."""
+    z = flat_frame.depth + np.float32(1.0)  # 3 m
+    z[380:, :] = 2.1
+    registered = RegisteredFrame(flat_frame.color, flat_frame.camera.color, RegisteredDepth(z, flat_frame.camera.color))
+    seen = keypoints(
+        {
+            "neck": (480, 150), "right_shoulder": (445, 150), "left_shoulder": (515, 150),
+            "right_hip": (455, 260), "left_hip": (505, 260), "left_knee": (505, 340), "right_knee": (455, 400),
+        }
+    )  # fmt: skip
+    person = NaiveLifter().lift(registered, [seen])[0]
+    knee, other = JOINT["right_knee"], JOINT["left_knee"]
+    assert person.keypoints[knee, 2] == pytest.approx(2.1)
+    assert (person.source[knee], person.source[other]) == ("inferred", OBSERVED)
+    assert person.sigma_m[knee] > 0.8 and person.confidence[knee] < 0.02
+    assert person.sigma_m[other] < 0.1 and person.confidence[other] > 0.6
+
+
+def test_shoulders_that_are_too_narrow_are_not_trusted(flat_frame: Frame):
+    """0.12 m apart, as of somebody in profile whose far shoulder is lifted to the near side; then 0.36 m."""
+    registered = register(flat_frame)
+    confidence, sigma = [], []
+    for half in (0.06, 0.18):
+        pixels = half * 540.7 / 2
+        seen = keypoints({"right_shoulder": (480 - pixels, 200), "left_shoulder": (480 + pixels, 200)})
+        person = NaiveLifter().lift(registered, [seen])[0]
+        rows_ = [JOINT["right_shoulder"], JOINT["left_shoulder"]]
+        confidence.append(person.confidence[rows_].max())
+        sigma.append(person.sigma_m[rows_].min())
+    assert confidence[0] < 0.5 < confidence[1]
+    assert sigma[0] > 0.1 > sigma[1]
