@@ -156,6 +156,15 @@ def test_changed_keypoints_or_cameras_need_a_restart(recording, tmp_path):
     (recording / "recording.json").write_text(json.dumps(info))
     with pytest.raises(RecordingError, match=r"cameras differs.*--restart"):
         run(recording, tmp_path / "out")
+    run(recording, tmp_path / "out", restart=True)
+    info["depth"]["unit_m"] *= 2
+    info["timestamps_s"] = [t + 5 for t in info["timestamps_s"]]
+    (recording / "recording.json").write_text(json.dumps(info))
+    with pytest.raises(RecordingError, match=r"unit_m differs: 0.001 then, 0.002 now.*--restart"):
+        run(recording, tmp_path / "out")
+    info["depth"]["unit_m"] /= 2
+    (recording / "recording.json").write_text(json.dumps(info))
+    assert [f.timestamp_s for f in run(recording, tmp_path / "out").frames][:2] == pytest.approx([5.0, 5.1])
 
 
 def test_frames_that_vanished_are_left_out_with_a_word(recording, tmp_path):
@@ -299,6 +308,8 @@ def test_pair_of_images(tmp_path, capsys, models):
     arguments[arguments.index("140")] = "150"
     assert main(arguments) == 2
     assert "cameras differs" in capsys.readouterr().err
+    assert main([*arguments, "--restart"]) == 0
+    assert recordings.open(tmp_path / "out" / "pair").camera.color.fx == 150
     cv2.imwrite(str(tmp_path / "d.png"), np.full((120, 160), 200, np.uint8))
     assert main([*arguments[:-1], str(tmp_path / "o3")]) == 2
     assert "d.png" in capsys.readouterr().err

@@ -52,6 +52,8 @@ class Settings:
     recording: str
     """absolute path"""
     cameras: dict[str, Any]
+    unit_m: float
+    """metres per stored depth value"""
     method: str
     detector: str
     detector_input: str
@@ -84,7 +86,8 @@ def estimate_recording(
     estimator = Estimator(method, detectors.create(detector, recording), min_score)
     source = (out / PAIR).resolve() if isinstance(recording, PairRecording) else recording.path.resolve()
     reads = _detector_input(recording, detector)
-    settings = Settings(str(source), recording.camera.to_json(), method, detector, reads, min_score)
+    cameras = recording.camera.to_json()
+    settings = Settings(str(source), cameras, recording.unit_m, method, detector, reads, min_score)
     _prepare(out, settings, restart)
     name = recording.name
     if isinstance(recording, PairRecording):
@@ -124,8 +127,8 @@ def signature(files: list[Path] | tuple[Path, ...]) -> str:
 
 def _kept(pair: PairRecording, folder: Path) -> Recording:
     """The pair as a recording folder beside its results, so that they can be viewed later."""
-    state = folder / "sources.txt"
-    now = signature(pair.sources(0))
+    state = folder / "made_from.json"
+    now = json.dumps([signature(pair.sources(0)), pair.unit_m, pair.camera.to_json()])
     if not (state.exists() and state.read_text() == now):
         write_recording(folder, pair, unit_m=pair.unit_m, color_format="png", overwrite=True)
         write_atomically(state, now)
@@ -177,17 +180,17 @@ class _Run:
 
     def _taken_over(self, done: FramePeople, position: int) -> FramePeople:
         """A finished frame; drawn again only if its picture is missing or its people have got other ids."""
-        frame = self._numbered(done)
+        frame = self._numbered(replace(done, timestamp_s=self._timestamp(position)))
         renamed = [p.id for p in frame.people] != [p.id for p in done.people] or any(
             p.keypoints_2d is not q.keypoints_2d for p, q in zip(frame.people, done.people, strict=True)
         )
         if self.overlays and (renamed or not self._picture(frame.index).exists()):
             self._draw(self.estimator.register(self.recording[position]), frame)
-        return frame if renamed else done
+        return frame if renamed or frame.timestamp_s != done.timestamp_s else done
 
     def _estimated(self, position: int) -> FramePeople:
-        index, times = self.recording.indices[position], self.recording.timestamps_s
-        frame = FramePeople(index, (), None if times is None else times[position])
+        index = self.recording.indices[position]
+        frame = FramePeople(index, (), self._timestamp(position))
         start = time.perf_counter()
         try:
             registered = self.estimator.register(self.recording[position])
@@ -200,6 +203,10 @@ class _Run:
         if self.overlays:
             self._draw(registered, frame)
         return frame
+
+    def _timestamp(self, position: int) -> float | None:
+        times = self.recording.timestamps_s
+        return None if times is None else times[position]
 
     def _numbered(self, frame: FramePeople) -> FramePeople:
         """With ids that stay with people, in their order."""

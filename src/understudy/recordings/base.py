@@ -29,6 +29,8 @@ class Recording(ABC):
     """how the format is called in messages"""
     looks_for: ClassVar[str]
     """what `recognizes` looks for, in words"""
+    unit_m: float = 0.001
+    """metres per stored depth value"""
 
     def __init__(
         self,

@@ -48,7 +48,7 @@ class FolderRecording(Recording):
         data = read_json(info)
         if data.get("format") != FORMAT:
             raise RecordingError(f"{info}: field 'format' must be {FORMAT!r}, got {data.get('format')!r}")
-        camera, self._unit_m = _camera_from_json(data, info)
+        camera, self.unit_m = _camera_from_json(data, info)
         self._color, self._depth = images_in(path / COLOR), images_in(path / DEPTH)
         indices = sorted(self._color.keys() | self._depth.keys())
         if not indices:
@@ -77,7 +77,7 @@ class FolderRecording(Recording):
         color, depth = read_color(color_path), read_depth(depth_path)
         check_size(color, self.camera.color, color_path, f"{INFO}: color")
         check_size(depth, self.camera.depth, depth_path, f"{INFO}: depth")
-        return color, depth * np.float32(self._unit_m)
+        return color, depth * np.float32(self.unit_m)
 
     def sources(self, position: int) -> tuple[Path, ...]:
         index = self.indices[position]

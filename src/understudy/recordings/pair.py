@@ -23,17 +23,12 @@ class PairRecording(Recording):
     looks_for = "nothing: open_pair(color, depth, K) opens it"
 
     def __init__(self, color: Path, depth: Path, camera: RGBDCamera, unit_m: float):
-        self._color, self._depth, self._unit_m = color, depth, unit_m
+        self._color, self._depth, self.unit_m = color, depth, unit_m
         super().__init__(color, camera, [0])
 
     @classmethod
     def recognizes(cls, path: Path) -> bool:
         return False
-
-    @property
-    def unit_m(self) -> float:
-        """Metres per depth value."""
-        return self._unit_m
 
     def sources(self, position: int) -> tuple[Path, ...]:
         return self._color, self._depth
@@ -42,7 +37,7 @@ class PairRecording(Recording):
         color, depth = read_color(self._color), read_depth(self._depth)
         check_size(color, self.camera.color, self._color, "its header, when it was opened,")
         check_size(depth, self.camera.depth, self._depth, "its header, when it was opened,")
-        return color, depth * np.float32(self._unit_m)
+        return color, depth * np.float32(self.unit_m)
 
 
 def open_pair(

@@ -56,7 +56,7 @@ class TumRecording(Recording):
             )
         if not (unit_m > 0 and math.isfinite(unit_m)):
             raise RecordingError(f"{path}: unit_m must be metres per depth value, above 0, got {unit_m!r}")
-        self._unit_m = unit_m
+        self.unit_m = unit_m
         self.unmatched_color = len(color_s) - len(self._pairs)
         self.unmatched_depth = len(depth_s) - len(self._pairs)
         if self.unmatched_color or self.unmatched_depth:
@@ -80,7 +80,7 @@ class TumRecording(Recording):
         color, depth = read_color(self._color[i]), read_depth(self._depth[j])
         check_size(color, self.camera.color, self._color[i], "the first image's size")
         check_size(depth, self.camera.depth, self._depth[j], "the first image's size")
-        return color, depth * np.float32(self._unit_m)
+        return color, depth * np.float32(self.unit_m)
 
     def sources(self, position: int) -> tuple[Path, ...]:
         i, j = self._pairs[position]
