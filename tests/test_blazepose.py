@@ -90,8 +90,18 @@ def person(x: float, score: float = 0.9) -> Sighting:
 
 
 def test_duplicates_go_and_neighbours_stay():
-    people = merge_duplicates([person(100, 0.5), person(105, 0.9), person(130, 0.8), person(300, 0.05)])
+    people = merge_duplicates([person(100, 0.7), person(105, 0.9), person(130, 0.8), person(300, 0.5)])
     assert [(p.uv[0, 0], p.score[0]) for p in people] == [(105, 0.9), (130, 0.8)]
+
+
+def test_somebody_in_a_leg_goes_unless_depth_tells_them_apart():
+    """A small figure whose joints all lie on the lower leg of a large one."""
+    large = person(100)
+    u, v = np.full(N_JOINTS, 102.0), np.linspace(200, 290, N_JOINTS)
+    keypoints = Keypoints2D.where(np.column_stack([u, v]), np.full(N_JOINTS, 0.7))
+    assert len(merge_duplicates([large, Sighting(keypoints, 20.0)])) == 1
+    both = [Sighting(large.keypoints, 60.0, group=0), Sighting(keypoints, 20.0, group=1)]
+    assert len(merge_duplicates(both)) == 2
 
 
 # --- with the networks ---

@@ -16,8 +16,9 @@ def body(layout: str, seed: int = 0) -> np.ndarray:
     """Somebody standing, in the named skeleton: shoulders, hips and neck where they are on a person."""
     rng = np.random.default_rng(seed)
     n, mapping = LAYOUTS[layout]
-    rows = np.column_stack([rng.uniform(20, 40, n), rng.uniform(20, 90, n), rng.uniform(0.5, 1, n)])
-    place = {"right_shoulder": (30, 40), "left_shoulder": (50, 40), "right_hip": (34, 70), "left_hip": (46, 70)}
+    rows = np.column_stack([rng.uniform(20, 40, n), rng.uniform(60, 90, n), rng.uniform(0.5, 1, n)])
+    place = {"nose": (40, 30), "right_eye": (38, 28), "left_eye": (42, 28), "right_ear": (36, 29), "left_ear": (44, 29)}
+    place |= {"right_shoulder": (30, 40), "left_shoulder": (50, 40), "right_hip": (34, 70), "left_hip": (46, 70)}
     for name, (u, v) in place.items():
         rows[mapping[JOINT[name]], :2] = u, v
     if layout == "body_25":
@@ -97,3 +98,40 @@ def test_recording_keypoints():
 def test_names_of_detectors(name):
     with pytest.raises(DetectorError, match="must be one of 'blazepose', 'recording', 'openpose-json:FOLDER'"):
         create(name)
+
+
+def test_real_body_25b_is_recognised():
+    from conftest import SHARED
+
+    folder = SHARED / "pose2sim" / "balancing_openpose_trc" / "pose" / "cam1_json"
+    if not folder.is_dir():
+        pytest.skip(f"the real keypoints {folder} are not on this machine")
+    assert OpenPoseJson(folder).layout == "body_25b"
+
+
+def test_agrees_with_openpose_on_a_real_video(models):
+    """A man balancing on one leg, a colour video without depth: our 2D against OpenPose's, every tenth frame."""
+    from conftest import SHARED
+
+    data = SHARED / "pose2sim"
+    if not data.is_dir():
+        pytest.skip(f"the real video in {data} is not on this machine")
+    av = pytest.importorskip("av", reason="reading the video needs the extra 'kinect'")
+    openpose = OpenPoseJson(data / "balancing_openpose_trc" / "pose" / "cam1_json")
+    ours = create("blazepose")
+    errors = []
+    with av.open(str(data / "Pose2Sim" / "Demo_SinglePerson" / "videos" / "cam01.mp4")) as video:
+        for k, image in enumerate(video.decode(video=0)):
+            if k % 10:
+                continue
+            color = image.to_ndarray(format="rgb24")
+            true = openpose.detect(color, index=k)[0]
+            found = ours.detect(color, index=k)
+            assert 1 <= len(found) <= 2  # he, and at times the woman in the background; never he twice
+            torso = np.linalg.norm(true.uv[JOINT["neck"]] - true.uv[[JOINT["right_hip"], JOINT["left_hip"]]].mean(0))
+            apart = [np.linalg.norm(p.uv - true.uv, axis=1) / torso for p in found]
+            best = int(np.argmin([np.median(a) for a in apart]))
+            errors.append(apart[best][(found[best].score > 0.5) & (true.score > 0.5)])
+    assert len(errors) == 10
+    pooled = np.concatenate(errors)
+    assert len(pooled) > 120 and (pooled < 0.2).mean() > 0.97

@@ -14,11 +14,12 @@ from jaxtyping import Float, UInt8
 from understudy.assets import model_path
 from understudy.detectors.blazepose_nets import DETECTOR_SIZE, LANDMARK_SIZE, BlazePoseNets, Landmarks, Region
 from understudy.detectors.windows import Scene, windows
-from understudy.skeleton import FACE, JOINT, N_JOINTS, TORSO, to_coco18
+from understudy.skeleton import BONES, FACE, JOINT, N_JOINTS, TORSO, to_coco18
 from understudy.types import Keypoints2D, RegisteredDepth
 
 _ON_PERSON, _UNMEASURED, _BEHIND_OTHER, _OFF_PERSON = 1.0, 0.9, 0.35, 0.25
 """What a keypoint's place is worth: on its person, in a depth hole, hidden by something nearer, on the background"""
+_LEAST = 0.65
 _SHOULDERS, _HIPS = TORSO[1:3], TORSO[3:5]
 _BODY = np.setdiff1d(np.arange(N_JOINTS), FACE)
 
@@ -45,6 +46,8 @@ class Sighting:
     keypoints: Keypoints2D
     torso: float
     """mid hip to mid shoulder, pixels; known also when some of these are outside the image"""
+    group: int = -1
+    """index of the thing in the depth image, -1 if none"""
 
     def life_size(self, scene: Scene) -> bool:
         """Whether torso and extent could be a person's, however turned, bent or cut off. True without depth."""
@@ -55,14 +58,21 @@ class Sighting:
         extent = float(np.ptp(self.keypoints.uv[self.keypoints.found], axis=0).max())
         return 0.08 < self.torso / metre < 1.1 and extent > 0.3 * metre
 
-    def coincides(self, other: Sighting) -> bool:
-        """Whether the joints of both lie within a quarter of a torso of each other (median; the face left out)."""
+    def repeats(self, other: Sighting) -> bool:
+        """Whether this is the other person once more: the joints of both coincide; or, unless depth tells them apart,
+        these joints lie along the other's bones (somebody seen in a leg, or another guess at a strange posture).
+        """
         p, q = self.keypoints, other.keypoints
         both = _BODY[p.found[_BODY] & q.found[_BODY]]
-        if len(both) < 3:
+        if len(both) >= 3:
+            apart = float(np.median(np.linalg.norm(p.uv[both] - q.uv[both], axis=1)))
+            if apart < 0.25 * max(self.torso, other.torso):
+                return True
+        if self.group != other.group and min(self.group, other.group) >= 0:
             return False
-        apart = float(np.median(np.linalg.norm(p.uv[both] - q.uv[both], axis=1)))
-        return apart < 0.25 * max(self.torso, other.torso)
+        near = (0.3 if self.torso < 0.5 * other.torso else 0.2) * other.torso
+        along = _distance_to_bones(p.uv[p.score > 0.2], q) < near
+        return len(along) > 0 and float(along.mean()) > 0.7
 
 
 class BlazePoseDetector:
@@ -167,12 +177,23 @@ class BlazePoseDetector:
         rows[:, 2] *= place * _agreement(apart, 0.2) * _agreement(from_plain, 0.4)
         rows[JOINT["neck"], :2] = rows[_SHOULDERS, :2].mean(0)
         rows[JOINT["neck"], 2] = rows[_SHOULDERS, 2].min()
-        return Sighting(Keypoints2D.where(rows[:, :2], rows[:, 2], torso_z), torso)
+        return Sighting(Keypoints2D.where(rows[:, :2], rows[:, 2], torso_z), torso, candidate.group)
 
 
 def _torso_length(rows: np.ndarray) -> float:
     """Mid shoulders to mid hips, pixels."""
     return float(np.linalg.norm(rows[_SHOULDERS, :2].mean(0) - rows[_HIPS, :2].mean(0)))
+
+
+def _distance_to_bones(uv: Float[np.ndarray, "n 2"], person: Keypoints2D) -> np.ndarray:
+    """Distance (pixels) of each point to the nearest bone of a person, shape (n,); infinite if there are no bones."""
+    ends = np.array(BONES)
+    ends = ends[person.found[ends].all(1)]
+    if not len(ends):
+        return np.full(len(uv), np.inf)
+    a, ab = person.uv[ends[:, 0]], person.uv[ends[:, 1]] - person.uv[ends[:, 0]]
+    t = ((uv[:, None] - a) * ab).sum(-1) / np.maximum((ab * ab).sum(-1), 1e-9)
+    return np.linalg.norm(uv[:, None] - a - t.clip(0, 1)[..., None] * ab, axis=-1).min(1)
 
 
 def _agreement(apart: np.ndarray, least: float) -> np.ndarray:
@@ -244,9 +265,10 @@ def _same(a: Candidate, b: Candidate) -> bool:
 
 
 def merge_duplicates(people: list[Sighting]) -> list[Keypoints2D]:
-    """Drops the weaker of two who coincide, and who has fewer than 4 joints that can be trusted."""
+    """Drops who repeats a stronger one, and whose six best joints have a mean score under `_LEAST`."""
     out: list[Sighting] = []
     for p in sorted(people, key=lambda p: -p.keypoints.score.sum()):
-        if (p.keypoints.score > 0.3).sum() >= 4 and not any(p.coincides(q) for q in out):
+        best = np.sort(p.keypoints.score)[-6:]
+        if best.mean() >= _LEAST and not any(p.repeats(q) for q in out):
             out.append(p)
     return [p.keypoints for p in out]

@@ -77,7 +77,10 @@ class OpenPoseJson:
         return Keypoints2D.from_rows(to_coco18(rows, self.layout))
 
     def _guess_layout(self) -> str:
-        """By the number of keypoints; among those with 25, BODY_25 has its neck (row 1) between rows 2 and 5."""
+        """By the number of keypoints. Both BODY_25 and BODY_25B have 25: eyes and ears are the rows close to the nose,
+        15 to 18 in the one and 1 to 4 in the other; everybody in the folder has a vote.
+        """
+        votes = 0
         for path in self._files.values():
             for rows in _read(path):
                 fitting = [name for name, (n, _) in LAYOUTS.items() if n == len(rows) and name != "blazepose"]
@@ -86,12 +89,19 @@ class OpenPoseJson:
                     raise DetectorError(f"{path}: pose_keypoints_2d has {len(rows)} keypoints; known: {sizes}")
                 if len(fitting) == 1:
                     return fitting[0]
-                if (rows[[1, 2, 5, 6, 8, 11], 2] > 0.1).all():
-                    xy = rows[:, :2]
-                    width = max(float(np.ptp(xy[rows[:, 2] > 0], axis=0).max()), 1.0)
-                    gap = float(np.linalg.norm(xy[1] - (xy[2] + xy[5]) / 2))
-                    return "body_25" if gap < 0.06 * width else "body_25b"
-        return "body_25"
+                votes += _face_is_first(rows)
+        return "body_25b" if votes > 0 else "body_25"
+
+
+def _face_is_first(rows: np.ndarray) -> int:
+    """1 if rows 1 to 4 lie closer to row 0, the nose, than rows 15 to 18 do; -1 if not; 0 if that cannot be said."""
+    if rows[0, 2] <= 0.1:
+        return 0
+    distances = np.where(rows[:, 2] > 0.1, np.linalg.norm(rows[:, :2] - rows[0, :2], axis=1), np.nan)
+    first, last = distances[1:5], distances[15:19]
+    if np.isnan(first).all() or np.isnan(last).all():
+        return 0
+    return 1 if np.nanmedian(first) < np.nanmedian(last) else -1
 
 
 def _read(path: Path) -> list[np.ndarray]:
