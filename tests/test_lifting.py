@@ -137,3 +137,16 @@ def test_shoulders_that_are_too_narrow_are_not_trusted(flat_frame: Frame):
         sigma.append(person.sigma_m[rows_].min())
     assert confidence[0] < 0.5 < confidence[1]
     assert sigma[0] > 0.1 > sigma[1]
+
+
+def test_keypoints_of_low_score_are_inferred(flat_frame: Frame):
+    registered = register(flat_frame)
+    rows_ = np.column_stack([np.linspace(300, 600, N_JOINTS), np.full((N_JOINTS, 1), 200), np.full((N_JOINTS, 1), 0.9)])
+    sure = NaiveLifter().lift(registered, [Keypoints2D.from_rows(rows_)])[0]
+    rows_[JOINT["left_wrist"], 2] = 0.25
+    weak = NaiveLifter().lift(registered, [Keypoints2D.from_rows(rows_)])[0]
+    wrist = JOINT["left_wrist"]
+    assert (sure.source[wrist], weak.source[wrist]) == (OBSERVED, "inferred")
+    assert weak.sigma_m[wrist] > 0.14 > sure.sigma_m[wrist]
+    assert weak.confidence[wrist] < 0.3 * sure.confidence[wrist]
+    np.testing.assert_array_equal(weak.keypoints, sure.keypoints)  # positions are the paper's

@@ -19,6 +19,9 @@ NEAREST = 3
 RADIUS = 0.02
 """search radius around a keypoint, in image widths: about 19 pixels of a 960-pixel image"""
 
+SEEN_SCORE = 0.5
+"""a 2D keypoint with a lower score is likely hidden (the paper's threshold for its score maps)"""
+
 # Metres from the visible surface to the joint inside the body: what naive lifting leaves out.
 _JOINT_DEPTH = {"neck": 0.06, "shoulder": 0.065, "elbow": 0.04, "wrist": 0.03, "hip": 0.11, "knee": 0.05, "ankle": 0.04}
 _SURFACE_TO_JOINT = np.array([_JOINT_DEPTH.get(name.split("_")[-1], 0.02) for name in JOINTS])
@@ -26,6 +29,7 @@ _SIGMA_2D = 0.004  # of a 2D keypoint, in image widths
 # Metres that a joint can lie before or behind the torso; further away it is something else that was measured.
 _REACH = {"neck": 0.35, "shoulder": 0.35, "hip": 0.35, "elbow": 0.55, "wrist": 0.8, "knee": 0.65, "ankle": 0.95}
 _REACH_OF_JOINT = np.array([_REACH.get(name.split("_")[-1], 0.4) for name in JOINTS])
+_SIGMA_UNSEEN = 0.3  # metres: of a joint that is surely hidden, lifted to what hides it
 _SHOULDERS = rows("right_shoulder", "left_shoulder")
 _SHOULDER_WIDTH = 0.33  # metres between the joints of an adult
 
@@ -44,8 +48,8 @@ class NaiveLifter:
 
     The depth is the median of the 3 valid values nearest to the keypoint. A joint without a 2D keypoint, or without 3
     valid depths within `RADIUS`, has no position. A hidden joint lands on what hides it: the position stays the
-    paper's, but where no body could reach from the torso to that depth, `source` is inferred and sigma large. Sigma
-    also grows for shoulders that come out too narrow.
+    paper's, but where the 2D score is low, or no body could reach from the torso to that depth, `source` is inferred
+    and sigma large. Sigma also grows for shoulders that come out too narrow.
     """
 
     def __init__(self, min_score: float = 0.2):
@@ -70,7 +74,8 @@ class NaiveLifter:
         if not lifted.any():
             return Person.failure(seen, "no depth near any of the 2D keypoints")
         beyond = _beyond_reach(seen, keypoints)
-        sigma = np.hypot(sigma, beyond)
+        weak = np.clip(SEEN_SCORE - seen.score, 0, None) / SEEN_SCORE
+        sigma = np.hypot(np.hypot(sigma, beyond), _SIGMA_UNSEEN * weak)
         sigma[_SHOULDERS] = np.hypot(sigma[_SHOULDERS], _missing_width(keypoints))
         # 10 cm in units of an isotropic Gaussian's sigma -> probability (chi distribution, 3 degrees of freedom)
         within = gammainc(1.5, np.where(lifted, 0.1 / np.where(lifted, sigma, 1), 0) ** 2 / 2)
@@ -79,7 +84,7 @@ class NaiveLifter:
             keypoints=np.where(lifted[:, None], keypoints, np.nan),
             confidence=seen.score * within,
             sigma_m=np.where(lifted, sigma, np.nan),
-            source=tuple(np.where(lifted, np.where(beyond > 0, INFERRED, OBSERVED), MISSING).tolist()),
+            source=tuple(np.where(lifted, np.where((beyond > 0) | (weak > 0), INFERRED, OBSERVED), MISSING).tolist()),
         )
 
 
