@@ -14,6 +14,7 @@ from understudy.estimator import Estimator
 from understudy.people_file import PeopleFile
 from understudy.pipeline import estimate_recording
 from understudy.skeleton import N_JOINTS
+from understudy.tracking import IdentityTracker
 from understudy.types import Frame, Keypoints2D
 
 CAMERA = RGBDCamera.aligned(Camera.from_fov(160, 120, 1.0))
@@ -89,6 +90,24 @@ def test_resumes_where_it_stopped(recording, tmp_path, monkeypatch):
     assert len(again.frames) == len(whole.frames)
     run(recording, tmp_path / "out", overlays=False)
     assert len(calls) == 6  # nothing left to do
+
+
+def test_interrupting_a_repeated_run_loses_nothing(recording, tmp_path, monkeypatch):
+    whole = run(recording, tmp_path / "out", overlays=False)
+    before = (tmp_path / "out" / "people.json").read_text()
+    update, calls = IdentityTracker.update, []
+
+    def interrupted(self, people):
+        calls.append(people)
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        return update(self, people)
+
+    monkeypatch.setattr(IdentityTracker, "update", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        run(recording, tmp_path / "out", overlays=False)
+    assert (tmp_path / "out" / "people.json").read_text() == before
+    assert len(whole.frames) == FRAMES
 
 
 def test_other_settings_do_not_mix(recording, tmp_path):

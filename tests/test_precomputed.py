@@ -2,6 +2,7 @@ import json
 
 import numpy as np
 import pytest
+from conftest import SHARED
 
 from understudy.detectors import create
 from understudy.detectors.precomputed import OpenPoseJson, RecordingKeypoints
@@ -101,8 +102,6 @@ def test_names_of_detectors(name):
 
 
 def test_real_body_25b_is_recognised():
-    from conftest import SHARED
-
     folder = SHARED / "pose2sim" / "balancing_openpose_trc" / "pose" / "cam1_json"
     if not folder.is_dir():
         pytest.skip(f"the real keypoints {folder} are not on this machine")
@@ -111,8 +110,6 @@ def test_real_body_25b_is_recognised():
 
 def test_agrees_with_openpose_on_a_real_video(models):
     """A man balancing on one leg, a colour video without depth: our 2D against OpenPose's, every tenth frame."""
-    from conftest import SHARED
-
     data = SHARED / "pose2sim"
     if not data.is_dir():
         pytest.skip(f"the real video in {data} is not on this machine")

@@ -5,11 +5,11 @@ import json
 import warnings
 from contextlib import suppress
 from fractions import Fraction
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from conftest import SHARED
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -20,8 +20,6 @@ from understudy.recordings import k4a, k4a_calibration, registry
 from understudy.recordings.pairing import pair_nearest
 from understudy.registration import register
 from understudy.types import Frame
-
-SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 
 def shared(name):

@@ -44,7 +44,7 @@ class Lifter(Protocol):
 
 
 class NaiveLifter:
-    """The paper's baseline (section IV, "naive lifting"): each 2D keypoint, back-projected at the depth under it.
+    """The paper's baseline, "naive lifting": each 2D keypoint, back-projected at the depth under it.
 
     The depth is the median of the 3 valid values nearest to the keypoint. A joint without a 2D keypoint, or without 3
     valid depths within `RADIUS`, has no position. A hidden joint lands on what hides it: the position stays the

@@ -97,7 +97,7 @@ def estimate_recording(
         for _ in _bar(run, len(recording), progress):
             pass
     finally:  # also when interrupted: what is done can be looked at
-        result = PeopleFile(method, name, tuple(run.results))
+        result = PeopleFile(method, name, run.known())
         result.write(out / PEOPLE)
     return result
 
@@ -177,6 +177,11 @@ class _Run:
                     journal.flush()
                 self.results.append(frame)
                 yield frame
+
+    def known(self) -> tuple[FramePeople, ...]:
+        """What there is of every frame: of this run, and from the journal for frames that it has not reached."""
+        frames = {i: done.frame for i, done in self._journal.items()} | {f.index: f for f in self.results}
+        return tuple(frames[i] for i in self.recording.indices if i in frames)
 
     def _taken_over(self, done: FramePeople, position: int) -> FramePeople:
         """A finished frame; drawn again only if its picture is missing or its people have got other ids."""

@@ -14,7 +14,7 @@ from understudy.types import Person
 MEMORY = 30
 """frames for which a lost person's id is kept"""
 _GATE = 0.6  # metres between the torsos of one person in successive frames, growing while the person is lost
-_GATE_PIXELS = 0.5  # torso lengths, for people without 3D
+_GATE_IN_IMAGE = 0.5  # the same in torso sizes, for people without 3D
 
 
 @dataclass
@@ -74,5 +74,7 @@ def _cost(track: _Track, person: Person) -> float:
         if not both.any():
             return 1.0
         size = max(float(np.ptp(q.uv[TORSO][both], axis=0).max()), 10.0)
-        distance = float(np.median(np.linalg.norm(p.uv[TORSO][both] - q.uv[TORSO][both], axis=1))) / size / _GATE_PIXELS
+        distance = (
+            float(np.median(np.linalg.norm(p.uv[TORSO][both] - q.uv[TORSO][both], axis=1))) / size / _GATE_IN_IMAGE
+        )
     return min(distance, 1.0)

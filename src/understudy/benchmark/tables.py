@@ -41,7 +41,10 @@ class Column:
 
 
 MS_PER_FRAME: Final = "ms_per_frame"
-MS_DEFINITION: Final = "Wall time of the estimation of a recording (reading the images included) / its frames."
+MS_DEFINITION: Final = (
+    "Wall time per frame, reading its images included: as the estimate reports it (`estimate_into`: the median over "
+    "the frames, which leaves out the loading of the networks), else that of the whole recording / its frames."
+)
 
 COLUMNS: Final = (
     Column("EPE", "cm", "epe_cm_all", 1),

@@ -20,6 +20,7 @@ from understudy.types import Keypoints2D, RegisteredDepth
 _ON_PERSON, _UNMEASURED, _BEHIND_OTHER, _OFF_PERSON = 1.0, 0.9, 0.35, 0.25
 """What a keypoint's place is worth: on its person, in a depth hole, hidden by something nearer, on the background"""
 _LEAST = 0.65
+_WITHIN_TORSO = np.random.default_rng(0).dirichlet(np.ones(4), 60)  # weights of its corners: points all over it
 _SHOULDERS, _HIPS = TORSO[1:3], TORSO[3:5]
 _BODY = np.setdiff1d(np.arange(N_JOINTS), FACE)
 
@@ -221,8 +222,7 @@ def _group_between(scene: Scene, hip: np.ndarray, shoulder: np.ndarray) -> int:
 def _torso_depth(scene: Scene, candidate: Candidate, rows: np.ndarray) -> float | None:
     """Median depth (metres) of the person's own cells between shoulders and hips; None where nothing was measured."""
     corners = rows[TORSO[1:], :2]
-    weights = np.random.default_rng(0).dirichlet(np.ones(4), 60)
-    row, col, inside = scene.grid.cells_of(weights @ corners)
+    row, col, inside = scene.grid.cells_of(_WITHIN_TORSO @ corners)
     z = scene.grid.z[row, col]
     good = inside & (z > 0)
     own = good & (scene.group_of_cell[row, col] == candidate.group)
