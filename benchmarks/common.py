@@ -32,7 +32,7 @@ def report(name: str, heads: list[str], rows: list[list[str]], notes: str = "") 
     """Prints a table, and keeps it in results/NAME.md with the command, versions and hardware."""
     lines = ["| " + " | ".join(heads) + " |", "|" + "---|" * len(heads)]
     lines += ["| " + " | ".join(row) + " |" for row in rows]
-    packages = ", ".join(f"{p} {version(p)}" for p in ("numpy", "scipy", "opencv-python-headless", "ai-edge-litert"))
+    packages = ", ".join(f"{p} {version(p)}" for p in ("numpy", "scipy", "opencv-python-headless", "openvino"))
     text = "\n".join(
         [
             f"# {name}",

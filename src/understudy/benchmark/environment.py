@@ -10,7 +10,7 @@ from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
 
-_PACKAGES = ("understudy", "numpy", "scipy", "opencv-python-headless", "ai-edge-litert")
+_PACKAGES = ("understudy", "numpy", "scipy", "opencv-python-headless", "openvino")
 
 
 def environment() -> dict[str, object]:

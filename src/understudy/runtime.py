@@ -1,0 +1,99 @@
+"""Runs neural networks on the CPU. The one place that knows OpenVINO.
+
+Always in float32: left alone, OpenVINO computes in bfloat16 where the processor can, and joints end up elsewhere.
+Calls are made for a short answer: all threads work on one call, and calls from several threads take turns.
+
+OpenVINO's Python package reports every import of itself to Google Analytics and puts an id into the user's home, both
+through `openvino_telemetry`. That module is barred first; OpenVINO then takes a stub of its own, which does nothing.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from understudy.errors import ModelFileError, one_of
+
+KINDS: Final = (".tflite", ".onnx", ".xml")
+"""File name endings: TensorFlow Lite, ONNX, OpenVINO IR (its weights beside it, in .bin)."""
+
+
+class Network:
+    """A network, ready to run.
+
+    It may be called from several threads at once: each call has buffers of its own. The same inputs give the same
+    numbers, bit for bit, in every call.
+    """
+
+    def __init__(self, compiled: Any, outputs: Sequence[str] = ()):
+        self._compiled = compiled
+        self._idle: list[Any] = []  # requests that nobody uses; pop and append are atomic
+        self.inputs: Final[tuple[str, ...]] = _names(compiled.inputs)
+        self.outputs: Final[tuple[str, ...]] = tuple(outputs) or _names(compiled.outputs)
+
+    def __call__(self, *inputs: np.ndarray, **named: np.ndarray) -> tuple[np.ndarray, ...]:
+        """The outputs, in the order of `self.outputs`; they are the caller's to keep.
+
+        Inputs come in the order of `self.inputs`, or by these names.
+        """
+        given = {**dict(zip(self.inputs, inputs, strict=False)), **named}
+        if set(given) != set(self.inputs) or len(inputs) + len(named) != len(self.inputs):
+            raise TypeError(f"the network takes each of {self.inputs} once, not {len(inputs)} arrays and {list(named)}")
+        try:
+            request = self._idle.pop()
+        except IndexError:
+            request = self._compiled.create_infer_request()
+        results = request.infer([given[name] for name in self.inputs])
+        self._idle.append(request)  # unless it failed
+        return tuple(results[i] for i in range(len(self.outputs)))
+
+
+def load(path: Path, *, threads: int | None = None, outputs: Sequence[str] = ()) -> Network:
+    """Reads a network from a file of one of the `KINDS` and compiles it for this CPU. Writes no files.
+
+    threads: that work on a call; default: OpenVINO's choice, one a physical core. outputs: names of those that are
+    wanted, in this order (what only the others need is not computed); default: all.
+    Raises ModelFileError when the file is absent, damaged or not such a network.
+    """
+    if path.suffix not in KINDS:
+        raise ModelFileError(f"{path}: a network's file name must end in {one_of(KINDS)}")
+    if not path.is_file():
+        raise ModelFileError(f"{path}: there is no such file")
+    openvino, core = _openvino()
+    config: dict[str, object] = {
+        "INFERENCE_PRECISION_HINT": "f32",
+        "PERFORMANCE_HINT": "LATENCY",
+        "ENABLE_CPU_PINNING": False,  # other programs use these cores, too
+    }
+    if threads is not None:
+        config["INFERENCE_NUM_THREADS"] = threads
+    try:
+        model = core.read_model(path)
+        if outputs:
+            results = {name: result for result in model.get_results() for name in result.output(0).names}
+            if absent := [name for name in outputs if name not in results]:
+                raise ModelFileError(f"{path}: the network has no output {absent[0]!r}; it has {one_of(results)}")
+            model = openvino.Model([results[name] for name in outputs], model.get_parameters())
+        return Network(core.compile_model(model, "CPU", config), outputs)
+    except RuntimeError as e:
+        lines = [line for line in str(e).splitlines() if line and not line.startswith(("Exception from", "Check"))]
+        raise ModelFileError(f"{path}: damaged, or not a network that OpenVINO can read: {' '.join(lines)}") from e
+
+
+@cache
+def _openvino() -> tuple[Any, Any]:
+    """The module, silenced, and its `Core`."""
+    sys.modules.setdefault("openvino_telemetry", None)  # type: ignore[arg-type]  # None: importing it fails
+    import openvino
+
+    return openvino, openvino.Core()
+
+
+def _names(ports: Sequence[Any]) -> tuple[str, ...]:
+    """One name of each; its number where it has none."""
+    return tuple(min(port.names, default=str(i)) for i, port in enumerate(ports))

@@ -1,0 +1,85 @@
+"""Weights and checkpoints as safetensors: tensors and words only, nothing that could run (torch)."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor
+
+from understudy.errors import ModelFileError
+from understudy.files import write_atomically
+from understudy.voxelposenet.net import NetConfig, VoxelPoseNet
+
+FORMAT = "understudy-voxelposenet/1"
+
+
+def save_weights(path: Path, state: Mapping[str, Tensor], config: NetConfig, about: Mapping[str, str]) -> None:
+    """The weights with the sizes of their network, and whatever words are to travel with them."""
+    tensors = {k: v.detach().cpu().contiguous().clone() for k, v in state.items()}
+    words = {"format": FORMAT, "net": json.dumps(asdict(config)), **about}
+    write_atomically(path, save(tensors, words))
+
+
+def load_net(path: Path) -> VoxelPoseNet:
+    """The network that `save_weights` wrote, ready for use. Raises ModelFileError for anything else."""
+    tensors, words = _read(path)
+    if words.get("format") != FORMAT:
+        raise ModelFileError(f"{path}: format is {words.get('format')!r}, must be {FORMAT!r}")
+    sizes = json.loads(words["net"])
+    net = VoxelPoseNet(NetConfig(**{**sizes, "channels": tuple(sizes["channels"])}))
+    try:
+        net.load_state_dict(tensors)
+    except RuntimeError as e:
+        raise ModelFileError(f"{path}: the weights do not fit the network that the file describes: {e}") from e
+    return net.eval()
+
+
+def save_checkpoint(
+    path: Path,
+    net: torch.nn.Module,
+    average: Mapping[str, Tensor],
+    optimizer: torch.optim.Optimizer,
+    step: int,
+    seconds: float,
+) -> None:
+    """All that a run needs to go on."""
+    tensors = {f"net/{k}": v for k, v in net.state_dict().items()} | {f"average/{k}": v for k, v in average.items()}
+    for i, values in optimizer.state_dict()["state"].items():
+        tensors |= {f"optimizer/{i}/{k}": v for k, v in values.items()}
+    flat = {k: v.detach().cpu().contiguous().clone() for k, v in tensors.items()}
+    write_atomically(path, save(flat, {"step": str(step), "seconds": str(seconds)}))
+
+
+def load_checkpoint(
+    path: Path, net: torch.nn.Module, average: dict[str, Tensor], optimizer: torch.optim.Optimizer
+) -> tuple[int, float]:
+    """Puts back what `save_checkpoint` wrote; returns the step and the seconds of training so far."""
+    tensors, words = _read(path)
+    parts: dict[str, dict[str, Tensor]] = {"net": {}, "average": {}, "optimizer": {}}
+    for name, tensor in tensors.items():
+        part, _, rest = name.partition("/")
+        parts[part][rest] = tensor
+    net.load_state_dict(parts["net"])
+    for k, v in parts["average"].items():
+        average[k].copy_(v)
+    state: dict[int, dict[str, Tensor]] = {}
+    for name, tensor in parts["optimizer"].items():
+        i, _, k = name.partition("/")
+        state.setdefault(int(i), {})[k] = tensor
+    if state:
+        optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})
+    return int(words["step"]), float(words["seconds"])
+
+
+def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
+    try:
+        with safe_open(path, "pt") as f:
+            return {k: f.get_tensor(k) for k in f.keys()}, f.metadata() or {}  # noqa: SIM118
+    except (SafetensorError, OSError) as e:
+        raise ModelFileError(f"{path}: not a readable safetensors file: {e}") from e

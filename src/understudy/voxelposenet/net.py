@@ -1,0 +1,175 @@
+"""The default network (torch): a person's view grid and 2D keypoints -> one distribution per joint -> 3D joints.
+
+Made for a CPU. What the paper does at 64^3 with 64 channels happens here at 16^3: the occupancy grid is folded 4 x 4 x 4
+cells into channels, and everything that is constant along z (the score maps) passes through a 2D trunk whose result is
+added to the 3D features. The last layer unfolds to 32^3 scores per joint; their softmax is the joint's distribution.
+All inputs and outputs are in the coordinates of `understudy.voxels.PersonView`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from understudy.skeleton import N_JOINTS
+from understudy.voxels import CELL, CELLS, EMPTY, HALF
+
+FOLD = 4
+COARSE = CELLS // FOLD  # 16: cells along an edge of the 3D features
+_FREE = 0.25  # metres of truncation of the signed distance to the seen surface
+_SIGMA = 0.06  # metres: width of a keypoint's score map
+
+
+@dataclass(frozen=True)
+class NetConfig:
+    """Sizes of the default network."""
+
+    channels: tuple[int, int, int] = (48, 80, 128)
+    """features at 16^3, 8^3 and 4^3"""
+    channels_2d: int = 96
+    """features of the 2D trunk at 16^2"""
+    lifted: int = 12
+    """features per z slice that the 2D trunk writes into the volume"""
+    inside: bool = True
+    """use what lies in front of and behind the seen surface (free, hidden), not only the surface"""
+
+
+class Output(NamedTuple):
+    """What the network says of each person."""
+
+    joints: Float[Tensor, "b 18 3"]
+    """mean of each joint's distribution, metres, view coordinates"""
+    spread: Float[Tensor, "b 18 3"]
+    """standard deviation of the distribution along each axis, metres"""
+    head: Float[Tensor, "b 18 3"]
+    """log of sigma (metres; 68 % of errors are smaller), logit of 'within 10 cm', logit of 'seen by the camera'"""
+
+
+class _Residual(nn.Module):
+    def __init__(self, conv: type[nn.Module], norm: type[nn.Module], channels: int):
+        super().__init__()
+        self.a = nn.Sequential(conv(channels, channels, 3, padding=1, bias=False), norm(channels), nn.ReLU())
+        self.b = nn.Sequential(conv(channels, channels, 3, padding=1, bias=False), norm(channels))
+
+    def forward(self, x: Tensor) -> Tensor:
+        return F.relu(x + self.b(self.a(x)))
+
+
+def _block(conv: type[nn.Module], norm: type[nn.Module], inputs: int, outputs: int, size: int, stride: int) -> nn.Module:
+    layer = conv(inputs, outputs, size, stride=stride, padding=size // 2 if size % 2 else 0, bias=False)
+    return nn.Sequential(layer, norm(outputs), nn.ReLU())
+
+
+class VoxelPoseNet(nn.Module):
+    """See the module's text."""
+
+    def __init__(self, config: NetConfig | None = None):
+        super().__init__()
+        self.config = config = config or NetConfig()
+        c16, c8, c4 = config.channels
+        two, three = (nn.Conv2d, nn.BatchNorm2d), (nn.Conv3d, nn.BatchNorm3d)
+        self.maps = _block(*two, N_JOINTS + 2, config.channels_2d, FOLD, FOLD)
+        self.trunk_2d = nn.Sequential(*(_Residual(*two, config.channels_2d) for _ in range(2)))
+        self.lift = nn.Conv2d(config.channels_2d, c16 + COARSE * config.lifted, 1)
+        volume = FOLD**3 + (FOLD**2 if config.inside else 0) + config.lifted + 4
+        self.first = nn.Conv3d(volume, c16, 1, bias=False)
+        self.first_norm = nn.BatchNorm3d(c16)
+        self.block16 = _Residual(*three, c16)
+        self.down8 = _block(*three, c16, c8, 2, 2)
+        self.block8 = nn.Sequential(_Residual(*three, c8), _Residual(*three, c8))
+        self.down4 = _block(*three, c8, c4, 2, 2)
+        self.block4 = nn.Sequential(_Residual(*three, c4), _Residual(*three, c4))
+        self.up8 = nn.ConvTranspose3d(c4, c8, 2, stride=2)
+        self.merge8 = _Residual(*three, c8)
+        self.up16 = nn.ConvTranspose3d(c8, c16, 2, stride=2)
+        self.merge16 = _Residual(*three, c16)
+        self.score = nn.Conv3d(c16, N_JOINTS * 8, 1)
+        self.features = nn.Conv3d(c16, 32, 1)
+        self.embedding = nn.Parameter(torch.zeros(N_JOINTS, 32))
+        self.judge = nn.Sequential(nn.Linear(32 + 8, 64), nn.ReLU(), nn.Linear(64, 32), nn.ReLU(), nn.Linear(32, 3))
+        edges = torch.arange(2 * COARSE, dtype=torch.float32)
+        self.register_buffer("centers", _sub_centers((edges + 0.5) * (2 * HALF / len(edges)) - HALF), persistent=False)
+        fine = (torch.arange(CELLS, dtype=torch.float32) + 0.5) * CELL - HALF
+        self.register_buffer("fine", fine, persistent=False)
+        self.register_buffer("coarse", fine.reshape(COARSE, FOLD).mean(1), persistent=False)
+
+    def forward(
+        self, depth: Float[Tensor, "b 2 64 64"], keypoints: Float[Tensor, "b 18 3"], root_z: Float[Tensor, "b 1"]
+    ) -> Output:
+        """Inputs as `understudy.voxels.PersonView` makes them. See `Output`."""
+        _, output = self.scores(depth, keypoints, root_z)
+        return output
+
+    def scores(self, depth: Tensor, keypoints: Tensor, root_z: Tensor) -> tuple[Float[Tensor, "b 18 8 4096"], Output]:
+        """Also the logits over the 32^3 cells: 8 sub-cells (z, y, x) of each of the 16^3 (z, y, x)."""
+        flat = self.trunk_2d(self.maps(self._flat_input(depth, keypoints)))
+        b, c16 = len(depth), self.config.channels[0]
+        added, lifted = self.lift(flat).split([c16, COARSE * self.config.lifted], 1)
+        x = self.first(self._volume(depth, root_z, lifted.reshape(b, -1, COARSE, COARSE, COARSE)))
+        x16 = self.block16(F.relu(self.first_norm(x + added[:, :, None])))
+        x8 = self.block8(self.down8(x16))
+        x4 = self.block4(self.down4(x8))
+        x8 = self.merge8(F.relu(x8 + self.up8(x4)))
+        x16 = self.merge16(F.relu(x16 + self.up16(x8)))
+        logits = self.score(x16).reshape(b, N_JOINTS, 8, COARSE**3).float()
+        return logits, self._read(logits, self.features(x16), keypoints)
+
+    def _flat_input(self, depth: Tensor, keypoints: Tensor) -> Tensor:
+        """Score maps, and the nearest depth with its mask."""
+        near = depth[:, :1]
+        seen = (near < 0.5 * (EMPTY + HALF)).to(near.dtype)
+        dx = torch.exp(-(((self.fine - keypoints[..., :1]) / _SIGMA) ** 2) / 2) * keypoints[..., 2:]
+        dy = torch.exp(-(((self.fine - keypoints[..., 1:2]) / _SIGMA) ** 2) / 2)
+        return torch.cat([dy[..., :, None] * dx[..., None, :], near * seen, seen], 1)
+
+    def _volume(self, depth: Tensor, root_z: Tensor, lifted: Tensor) -> Tensor:
+        """3D features at 16^3, axes (z, y, x)."""
+        b = len(depth)
+        near = depth[:, :1]
+        offset = ((depth[:, :, None] - self.fine[:, None, None]) / CELL).to(lifted.dtype)
+        surface = F.relu(1 - offset.abs().amin(1))
+        folded = surface.reshape(b, COARSE, FOLD, COARSE, FOLD, COARSE, FOLD).permute(0, 2, 4, 6, 1, 3, 5)
+        parts = [folded.reshape(b, FOLD**3, COARSE, COARSE, COARSE), lifted]
+        if self.config.inside:
+            seen = (near < 0.5 * (EMPTY + HALF)).to(near.dtype)
+            free = ((near - self.coarse[None, :, None, None]) / _FREE).clamp(-1, 1) * seen
+            free = free.reshape(b, COARSE, COARSE, FOLD, COARSE, FOLD).permute(0, 3, 5, 1, 2, 4)
+            parts.append(free.reshape(b, FOLD**2, COARSE, COARSE, COARSE))
+        c = self.coarse
+        shape = (b, 1, COARSE, COARSE, COARSE)
+        scale = c[None, :] / root_z
+        parts += [
+            c[None, None, :, None, None].expand(shape),
+            c[None, None, None, :, None].expand(shape),
+            c[None, None, None, None, :].expand(shape),
+            scale[:, None, :, None, None].expand(shape),
+        ]
+        return torch.cat([p.to(lifted.dtype) for p in parts], 1)
+
+    def _read(self, logits: Tensor, features: Tensor, keypoints: Tensor) -> Output:
+        """Means, spreads, and the judge's word from features where each joint is believed to be."""
+        b = len(logits)
+        p = logits.reshape(b, N_JOINTS, -1).softmax(-1)
+        mean = p @ self.centers
+        spread = (p @ self.centers**2 - mean**2).clamp_min(1e-6).sqrt()
+        place = p.reshape(b, N_JOINTS, 8, -1).sum(2)
+        local = place @ features.float().reshape(b, features.shape[1], -1).transpose(1, 2)
+        uv, score = keypoints[..., :2], keypoints[..., 2:]
+        off = ((mean[..., :2] - uv).abs() / 0.1).clamp_max(5) * (score > 0)
+        peak = p.amax(-1, keepdim=True).clamp_min(1e-6).log() / 5
+        said = torch.cat([spread.log(), off, score, (score > 0).to(score.dtype), peak], -1)
+        # The judge must not bend what it judges: it sees the distribution, but sends no gradient into it.
+        judged = self.judge(torch.cat([local.detach() + self.embedding, said.detach()], -1))
+        return Output(mean, spread, judged)
+
+
+def _sub_centers(edge: Tensor) -> Float[Tensor, "32768 3"]:
+    """(x, y, z) of every cell in the order of the logits: 8 sub-cells (z, y, x) of each of 16^3 cells (z, y, x)."""
+    z, y, x = torch.meshgrid(edge, edge, edge, indexing="ij")
+    points = torch.stack([x, y, z], -1).reshape(COARSE, 2, COARSE, 2, COARSE, 2, 3)
+    return points.permute(1, 3, 5, 0, 2, 4, 6).reshape(-1, 3).contiguous()

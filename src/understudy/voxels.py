@@ -1,0 +1,100 @@
+"""The person's view: the voxel grid of the default network, and the way between it and the camera.
+
+A virtual pinhole camera stands where the colour camera stands and looks straight at the person; its frame is called
+`view`. The grid has 64 x 64 columns, which are that camera's pixels, and 64 slices along its z. A 2D keypoint is thus
+exactly one column, wherever in the image the person is (the paper's metric grid has that only as an orthographic
+approximation), and what a surface hides lies exactly behind it in its column.
+
+View coordinates (metres): x = X/Z * root_z and y = Y/Z * root_z, the position scaled to the plane of the root; and
+z = Z - root_z. Cells have an edge of `CELL` in these coordinates and begin at -HALF.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from jaxtyping import Float, Float32
+
+from understudy.camera import Camera
+from understudy.types import RegisteredDepth
+
+HALF: Final = 1.32
+"""metres from the centre of the grid to its sides (the paper's box: 2.2 m times 1.2)"""
+CELLS: Final = 64
+CELL: Final = 2 * HALF / CELLS
+"""edge of a cell, 4.1 cm"""
+LIMIT: Final = 1.4
+"""metres: depths before or behind the grid are put here, just outside of it"""
+EMPTY: Final = 2.0
+"""stands in a depth grid for a column without any depth"""
+_NEAREST_Z = 0.1  # metres: nothing nearer to the camera is measured
+
+
+@dataclass(frozen=True, eq=False)
+class PersonView:
+    """Where one person's grid stands in the colour camera's frame."""
+
+    R_view_cam: Float[np.ndarray, "3 3"]
+    """the z axis of the view goes through the person"""
+    root_z: float
+    """metres along that axis to the grid's centre"""
+
+    @classmethod
+    def towards(cls, point: Float[np.ndarray, "3"]) -> PersonView:
+        """The view whose centre is `point` (metres, colour camera's frame, before the camera)."""
+        distance = float(np.linalg.norm(point))
+        return cls(rotation_to(point / distance), distance)
+
+    def from_cam(self, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+        """Colour camera's frame -> view coordinates; NaN for points that are not before the view's camera."""
+        p = points @ self.R_view_cam.T
+        z = np.where(p[..., 2:] > _NEAREST_Z, p[..., 2:], np.nan)
+        return np.concatenate([p[..., :2] / z * self.root_z, z - self.root_z], -1)
+
+    def to_cam(self, view: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+        """View coordinates -> colour camera's frame, metres."""
+        z = np.maximum(view[..., 2:] + self.root_z, _NEAREST_Z)
+        return np.concatenate([view[..., :2] * (z / self.root_z), z], -1) @ self.R_view_cam
+
+    def columns(self, camera: Camera, uv: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+        """x and y in view coordinates of image points (colour pixels); NaN where the camera has no ray."""
+        ray = np.concatenate([camera.normalized(uv), np.ones((len(uv), 1))], 1)
+        return self.from_cam(ray * self.root_z)[:, :2]
+
+    def depth_grid(self, points: Float[np.ndarray, "n 3"]) -> Float32[np.ndarray, "2 64 64"]:
+        """Nearest depth of each column, and farthest one within the grid; rows are y, columns x.
+
+        points: what the camera measured, colour camera's frame, metres. Depths are view z (relative to the root),
+        limited to +-LIMIT; `EMPTY` where nothing was measured. One value or a hundred in a column make no difference,
+        so that coarse and fine sensors look alike.
+        """
+        p = points @ self.R_view_cam.T.astype(points.dtype)
+        z = p[:, 2]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            cell = p[:, :2] * (self.root_z / CELL / z)[:, None] + CELLS // 2
+        inside = (z > _NEAREST_Z) & (cell >= 0).all(1) & (cell < CELLS).all(1)
+        column = cell[inside].astype(np.int32) @ np.array([1, CELLS], np.int32)
+        depth = (z[inside] - self.root_z).astype(np.float32)
+        grid = np.full((2, CELLS * CELLS), EMPTY, np.float32)
+        np.minimum.at(grid[0], column, depth.clip(-LIMIT, LIMIT))
+        within = np.abs(depth) < HALF
+        far = np.full(CELLS * CELLS, -EMPTY, np.float32)
+        np.maximum.at(far, column[within], depth[within])
+        grid[1] = np.where(far > -EMPTY, far, EMPTY)
+        return grid.reshape(2, CELLS, CELLS)
+
+
+def cloud(depth: RegisteredDepth) -> Float32[np.ndarray, "n 3"]:
+    """Every measured point of a frame: colour camera's frame, metres."""
+    row, column = np.nonzero(depth.z)
+    uv = np.stack([column, row], 1).astype(np.float64)
+    return depth.camera.unproject(uv, depth.z[row, column].astype(np.float64)).astype(np.float32)
+
+
+def rotation_to(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+    """R_view_cam: the smallest rotation that takes the unit vector `direction` to the z axis."""
+    x, y, z = direction
+    k = 1 / (1 + z)
+    return np.array([[1 - k * x * x, -k * x * y, -x], [-k * x * y, 1 - k * y * y, -y], [x, y, z]])

@@ -1,0 +1,229 @@
+"""The networks' runtime: its answers, its errors, and that it keeps to itself."""
+
+import os
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy import signal
+
+from understudy import assets, recordings, runtime
+from understudy.errors import ModelFileError
+from understudy.registration import register
+from understudy.runtime import Network, load
+
+CHANNELS, SIZE = 48, 12
+KERNELS = np.random.default_rng(0).normal(size=(CHANNELS, CHANNELS, 3, 3, 3)).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def ir(tmp_path_factory) -> Path:
+    """A network in OpenVINO's own format, in a folder with an awkward name: a 3D convolution, and a sum."""
+    ov, _ = runtime._openvino()
+    ops = ov.opset13
+    volume = ops.parameter([1, CHANNELS, SIZE, SIZE, SIZE], np.float32, name="volume")
+    scale = ops.parameter([1], np.float32, name="scale")
+    convolved = ops.convolution(volume, ops.constant(KERNELS), [1] * 3, [1] * 3, [1] * 3, [1] * 3)
+    outputs = [ops.multiply(convolved, scale), ops.reduce_sum(volume, [0, 1, 2, 3, 4])]
+    for node, name in zip([volume, scale, *outputs], ["volume", "scale", "convolved", "sum"], strict=True):
+        node.output(0).set_names({name})
+    path = tmp_path_factory.mktemp("Stühle und Türen") / "net.xml"
+    ov.save_model(ov.Model(outputs, [volume, scale]), path, compress_to_fp16=False)
+    return path
+
+
+@pytest.fixture(scope="module")
+def network(ir: Path) -> Network:
+    return load(ir, threads=2)
+
+
+def volume(seed: int) -> np.ndarray:
+    return np.random.default_rng(seed).normal(size=(1, CHANNELS, SIZE, SIZE, SIZE)).astype(np.float32)
+
+
+ONE, TWO = np.ones(1, np.float32), np.full(1, 2, np.float32)
+
+
+def test_convolution_in_three_dimensions_in_full_precision(network):
+    x = volume(1)
+    y, total = network(x, TWO)
+    exact = [sum(signal.correlate(c, k, "same") for c, k in zip(x[0].astype(float), ks, strict=True)) for ks in KERNELS]
+    assert y.dtype == np.float32
+    np.testing.assert_allclose(y[0], 2 * np.array(exact), atol=1e-5 * np.abs(exact).max())  # bfloat16: 4e-3
+    np.testing.assert_allclose(total, x.sum(dtype=float), atol=1e-3)
+
+
+def test_inputs_by_place_or_name_each_once(network):
+    assert network.inputs == ("volume", "scale") and network.outputs == ("convolved", "sum")
+    x = volume(2)
+    by_place = network(x, ONE)
+    np.testing.assert_array_equal(network(scale=ONE, volume=x)[0], by_place[0])
+    np.testing.assert_array_equal(network(x, scale=ONE)[0], by_place[0])
+    np.testing.assert_array_equal(network(x[:, ::-1], ONE)[0], network(x[:, ::-1].copy(), ONE)[0])  # strided
+    for places, names in (((), {}), ((x,), {}), ((x, ONE, ONE), {}), ((x, ONE), {"scale": ONE}), ((x,), {"size": ONE})):
+        with pytest.raises(TypeError, match=r"each of \('volume', 'scale'\) once"):
+            network(*places, **names)
+
+
+def test_chosen_outputs_in_the_chosen_order(ir, network):
+    x = volume(3)
+    np.testing.assert_array_equal(load(ir, outputs=["sum"])(x, ONE)[0], network(x, ONE)[1])
+    swapped = load(ir, threads=2, outputs=["sum", "convolved"])
+    assert swapped.outputs == ("sum", "convolved")
+    np.testing.assert_array_equal(swapped(x, ONE)[1], network(x, ONE)[0])
+    with pytest.raises(ModelFileError, match=r"no output 'mean'; it has one of 'convolved', 'sum'"):
+        load(ir, outputs=["mean"])
+
+
+def test_results_are_the_callers(network):
+    first = network(volume(4), ONE)[0]
+    copy = first.copy()
+    network(volume(5), ONE)
+    np.testing.assert_array_equal(first, copy)
+    first[:] = 0
+    np.testing.assert_array_equal(network(volume(4), ONE)[0], copy)
+
+
+def test_many_threads_get_the_same_bits(network):
+    inputs = [volume(seed) for seed in range(6)]
+    alone = [network(x, ONE)[0] for x in inputs]
+    with ThreadPoolExecutor(8) as pool:
+        together = pool.map(lambda i: (i, network(inputs[i], ONE)[0]), list(range(6)) * 20)
+        assert all((alone[i] == y).all() for i, y in together)
+
+
+def test_a_call_that_failed_leaves_no_trace(network):
+    expected = network(volume(6), ONE)[0]
+    with pytest.raises(RuntimeError):
+        network(volume(6)[:, :, :5], ONE)
+    np.testing.assert_array_equal(network(volume(6), ONE)[0], expected)
+
+
+def onnx_file() -> bytes:
+    """y = relu(x), three numbers, in protobuf's wire format."""
+
+    def field(number: int, content: bytes | int) -> bytes:
+        if isinstance(content, int):
+            return bytes([number << 3, content])
+        return bytes([number << 3 | 2, len(content)]) + content
+
+    def value(name: bytes) -> bytes:
+        shape = field(1, field(1, 3))  # one dimension of 3
+        return field(1, name) + field(2, field(1, field(1, 1) + field(2, shape)))  # element type 1: float
+
+    node = field(1, b"x") + field(2, b"y") + field(4, b"Relu")
+    graph = field(1, node) + field(2, b"g") + field(11, value(b"x")) + field(12, value(b"y"))
+    return field(1, 8) + field(7, graph) + field(8, field(2, 13))
+
+
+def test_onnx(tmp_path):
+    path = tmp_path / "net.onnx"
+    path.write_bytes(onnx_file())
+    (y,) = load(path)(np.array([-1, 0, 2], np.float32))
+    np.testing.assert_array_equal(y, [0, 0, 2])
+
+
+@pytest.mark.parametrize("kind", runtime.KINDS)
+@pytest.mark.parametrize("content", [b"", b"not a network", bytes(range(256)) * 40])
+def test_damaged_files(tmp_path, kind, content):
+    path = tmp_path / f"net{kind}"
+    path.write_bytes(content)
+    with pytest.raises(ModelFileError, match=rf"net\{kind}: damaged, or not a network"):
+        load(path)
+
+
+def test_truncated_files(tmp_path, ir, models):
+    (tmp_path / "net.xml").write_bytes(ir.read_bytes())
+    for weights in (None, ir.with_suffix(".bin").read_bytes()[:1000]):
+        if weights is not None:
+            (tmp_path / "net.bin").write_bytes(weights)
+        with pytest.raises(ModelFileError, match=r"net\.xml: damaged, .* bin file"):
+            load(tmp_path / "net.xml")
+    whole = assets.model_path("pose_detection").read_bytes()
+    (tmp_path / "net.tflite").write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(ModelFileError, match=r"net\.tflite: damaged"):
+        load(tmp_path / "net.tflite")
+
+
+def test_absent_files_and_other_kinds(tmp_path):
+    with pytest.raises(ModelFileError, match=r"net\.onnx: there is no such file"):
+        load(tmp_path / "net.onnx")
+    with pytest.raises(ModelFileError, match=r"net\.pt: .* must end in one of '\.tflite', '\.onnx', '\.xml'"):
+        load(tmp_path / "net.pt")
+
+
+def test_import_is_late():
+    code = "import sys, understudy.runtime, understudy.detectors.blazepose, understudy.pipeline\n"
+    code += "assert not {m for m in sys.modules if m.startswith('openvino')}"
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_nothing_is_sent_and_nothing_written(tmp_path, ir):
+    """Importing OpenVINO alone would send an event (from a child process) and put an id into the user's home."""
+    code = f"""if True:
+        import multiprocessing, os, socket, sys
+        from pathlib import Path
+        def sent(*args, **kwargs):
+            with open({str(tmp_path / "sent")!r}, "a") as f:
+                f.write(repr(args))
+            raise OSError("not in this test")
+        socket.getaddrinfo = socket.socket.connect = socket.socket.connect_ex = socket.socket.sendto = sent
+        os.fork = os.posix_spawn = multiprocessing.Process.start = sent
+        import numpy as np
+        from understudy.runtime import load
+        network = load(Path({str(ir)!r}))
+        network(np.zeros((1, {CHANNELS}, {SIZE}, {SIZE}, {SIZE}), np.float32), np.ones(1, np.float32))
+        from openvino import convert_model  # what else might send, later on
+        convert_model({str(ir.parent / "relu.onnx")!r})
+        assert not hasattr(sys.modules["openvino_telemetry"], "Telemetry")
+    """
+    (ir.parent / "relu.onnx").write_bytes(onnx_file())
+    home, work = tmp_path / "home", tmp_path / "work"
+    home.mkdir()
+    work.mkdir()
+    environment = {
+        k: v for k, v in os.environ.items() if k not in ("CI", "TF_BUILD", "JENKINS_URL")
+    }  # these silence it
+    environment |= {"HOME": str(home), "XDG_CACHE_HOME": str(home / "cache"), "TMPDIR": str(work)}
+    out = subprocess.run([sys.executable, "-c", code], env=environment, cwd=work, capture_output=True, text=True)
+    assert (out.returncode, out.stdout, out.stderr) == (0, "", "")
+    assert not (tmp_path / "sent").exists()
+    assert not list(home.iterdir()) and not list(work.iterdir())
+    assert sorted(p.name for p in ir.parent.iterdir()) == ["net.bin", "net.xml", "relu.onnx"]
+
+
+# --- BlazePose, against the reference implementation of its file format ---
+
+
+@pytest.mark.parametrize("name", ["pose_detection", "pose_landmark_full"])
+def test_blazepose_as_litert_computes_it(models, monkeypatch, name):
+    """Every crop of a frame with several people, through both."""
+    litert = pytest.importorskip("ai_edge_litert.interpreter", reason="the oracle ai-edge-litert is not installed")
+    from understudy.detectors.blazepose import BlazePoseDetector
+
+    calls = []
+
+    def record(self: Network, image: np.ndarray) -> tuple[np.ndarray, ...]:
+        calls.append((image, self.outputs, original(self, image)))
+        return calls[-1][-1]
+
+    original = Network.__call__
+    monkeypatch.setattr(Network, "__call__", record)
+    frame = register(recordings.open("sample")[0])
+    assert len(BlazePoseDetector().detect(frame.color, frame.depth)) == 2
+
+    interpreter = litert.Interpreter(str(assets.model_path(name)), num_threads=1)
+    interpreter.allocate_tensors()
+    source, sinks = interpreter.get_input_details()[0], interpreter.get_output_details()
+    calls = [c for c in calls if c[0].shape == tuple(source["shape"])]
+    assert len(calls) >= 5
+    for image, names, ours in calls:
+        interpreter.set_tensor(source["index"], image)
+        interpreter.invoke()
+        theirs = {sink["name"]: interpreter.get_tensor(sink["index"]) for sink in sinks}
+        for output, mine in zip(names, ours, strict=True):
+            assert mine.shape == theirs[output].shape
+            np.testing.assert_allclose(mine, theirs[output], atol=0.02)  # pixels of the crop, or logits
