@@ -8,6 +8,7 @@ time does not depend on them.
 
 from __future__ import annotations
 
+import os
 import sys
 import time
 from collections.abc import Callable
@@ -25,11 +26,12 @@ from understudy.voxelposenet.paper_net import PaperNet
 from understudy.voxelposenet.tensorflow_weights import VARIANTS
 
 THREADS = 2
-ROUNDS = 12
+ROUNDS = 5
 HINTS = {"INFERENCE_PRECISION_HINT": "f32", "INFERENCE_NUM_THREADS": THREADS, "PERFORMANCE_HINT": "LATENCY"}
 
 
 def main() -> None:
+    before = os.getloadavg()
     torch.set_num_threads(THREADS)
     torch.manual_seed(0)
     points, keypoints, camera, root = scene()
@@ -60,9 +62,11 @@ def main() -> None:
         "paper_net",
         ["variant", "parameters", "torch eager ms", "the same, channels last", "OpenVINO f32 ms", "difference"],
         rows,
-        f"One person (batch 1), 64^3 cells, {THREADS} threads: median (least) of {ROUNDS} rounds in each of which every "
-        f"column runs once; torch {torch.__version__}, OpenVINO {version('openvino')}. Difference: OpenVINO's largest to "
-        f"torch's over all three volumes, in standard deviations of the volume.\n\nAround the network: {around}.",
+        f"One person (batch 1), 64^3 cells, {THREADS} threads: median (least) of {ROUNDS} rounds in each of which "
+        f"everything runs once; torch {torch.__version__}, OpenVINO {version('openvino')}. Difference: OpenVINO's "
+        "largest to torch's over all three volumes, in standard deviations of the volume. Other jobs may have shared "
+        f"the cores: load average {before[0]:.1f} before, {os.getloadavg()[0]:.1f} after (idle machine: 0, about "
+        f"{THREADS}).\n\nAround the network: {around}.",
     )
 
 

@@ -87,7 +87,9 @@ def test_results_are_the_callers(network):
     np.testing.assert_array_equal(network(volume(4), ONE)[0], copy)
 
 
-def test_many_threads_get_the_same_bits(network):
+@pytest.mark.parametrize("streams", [1, 2])
+def test_many_threads_get_the_same_bits(ir, streams):
+    network = load(ir, threads=2, streams=streams)
     inputs = [volume(seed) for seed in range(6)]
     alone = [network(x, ONE)[0] for x in inputs]
     with ThreadPoolExecutor(8) as pool:

@@ -1,7 +1,6 @@
 """Runs neural networks on the CPU. The one place that knows OpenVINO.
 
 Always in float32: left alone, OpenVINO computes in bfloat16 where the processor can, and joints end up elsewhere.
-Calls are made for a short answer: all threads work on one call, and calls from several threads take turns.
 
 OpenVINO's Python package reports every import of itself to Google Analytics and puts an id into the user's home, both
 through `openvino_telemetry`. That module is barred first; OpenVINO then takes a stub of its own, which does nothing.
@@ -53,11 +52,12 @@ class Network:
         return tuple(results[i] for i in range(len(self.outputs)))
 
 
-def load(path: Path, *, threads: int | None = None, outputs: Sequence[str] = ()) -> Network:
+def load(path: Path, *, threads: int | None = None, streams: int = 1, outputs: Sequence[str] = ()) -> Network:
     """Reads a network from a file of one of the `KINDS` and compiles it for this CPU. Writes no files.
 
-    threads: that work on a call; default: OpenVINO's choice, one a physical core. outputs: names of those that are
-    wanted, in this order (what only the others need is not computed); default: all.
+    threads: in all; default: OpenVINO's choice, one a physical core. streams: how many calls run at a time, each on
+    its share of the threads; further calls wait. outputs: names of those that are wanted, in this order (what only
+    the others need is not computed); default: all.
     Raises ModelFileError when the file is absent, damaged or not such a network.
     """
     if path.suffix not in KINDS:
@@ -68,6 +68,7 @@ def load(path: Path, *, threads: int | None = None, outputs: Sequence[str] = ())
     config: dict[str, object] = {
         "INFERENCE_PRECISION_HINT": "f32",
         "PERFORMANCE_HINT": "LATENCY",
+        "NUM_STREAMS": streams,
         "ENABLE_CPU_PINNING": False,  # other programs use these cores, too
     }
     if threads is not None:

@@ -41,7 +41,13 @@ def _scores(rng: Rng, error: Array, high: float) -> Array:
 
 
 def detect_person(
-    uv: Array, seen: NDArray[np.bool_], inside: NDArray[np.bool_], torso: float, back: bool, others: list[Array], rng: Rng
+    uv: Array,
+    seen: NDArray[np.bool_],
+    inside: NDArray[np.bool_],
+    torso: float,
+    back: bool,
+    others: list[Array],
+    rng: Rng,
 ) -> Array | None:
     """Rows [u, v, score] of one person, or None where it is not found.
 

@@ -1,4 +1,4 @@
-"""Furniture and the room, from turned boxes and cylinders; everything is built in a frame of its own and then placed."""
+"""Furniture and the room, from turned boxes and cylinders, each built in a frame of its own and then placed."""
 
 from __future__ import annotations
 
@@ -165,7 +165,9 @@ def sofa(rng: Rng, seat: float, y_back: float, y_front: float, width: float, x: 
     return out
 
 
-def shelf(rng: Rng, y_front: float, depth: float, width: float, boards: list[float], top: float, x: float) -> list[Prop]:
+def shelf(
+    rng: Rng, y_front: float, depth: float, width: float, boards: list[float], top: float, x: float
+) -> list[Prop]:
     """A shelf unit open towards +y, with boards at the given heights."""
     color, out = wood(rng), []
     x0, x1, y0 = x - width / 2, x + width / 2, y_front - depth
@@ -218,9 +220,7 @@ def drawer_unit(rng: Rng, y_front: float, z: float, x: float, pull: float, y_bar
         out.append(span(f"cheek{k}", (a, y1 - depth, z - 0.1), (a + 0.02, y1, top), "paint", color))
     out.append(span("lid", (x0 - 0.01, y1 - depth, top), (x1 + 0.01, y1 + 0.01, top + 0.025), "wood", wood(rng)))
     out.append(span("front", (x0 + 0.01, y_front - 0.02, z - 0.09), (x1 - 0.01, y_front, z + 0.09), "paint", color))
-    out.append(
-        span("tray", (x0 + 0.03, y1 - 0.1, z - 0.08), (x1 - 0.03, y_front - 0.02, z - 0.06), "wood", wood(rng))
-    )
+    out.append(span("tray", (x0 + 0.03, y1 - 0.1, z - 0.08), (x1 - 0.03, y_front - 0.02, z - 0.06), "wood", wood(rng)))
     for k, a in enumerate((x0 + 0.03, x1 - 0.042)):
         out.append(span(f"rail{k}", (a, y1 - 0.1, z - 0.08), (a + 0.012, y_front - 0.02, z + 0.04), "wood", wood(rng)))
     metal = (0.25, 0.25, 0.26)
@@ -270,7 +270,9 @@ def occluder(rng: Rng) -> list[Prop]:
         z = rng.uniform(0.7, 0.78)
         return table(rng, 0.35, z, rng.uniform(1.0, 1.6), 0.7)
     if kind == 1:
-        return [p.moved(np.pi * rng.integers(2), np.zeros(2)) for p in sofa(rng, 0.42, 0.2, -0.4, rng.uniform(0.6, 1.6))]
+        return [
+            p.moved(np.pi * rng.integers(2), np.zeros(2)) for p in sofa(rng, 0.42, 0.2, -0.4, rng.uniform(0.6, 1.6))
+        ]
     if kind == 2:
         h = rng.uniform(0.85, 1.1)
         return [

@@ -19,7 +19,7 @@ from common import SEED
 from detections import detect_frame
 from sensor import Scene
 from sensors import SENSORS, Sensor, header, raw_depth, shaded_color
-from stage import Frame, Meshes, compose, meshes, truth_of
+from stage import Frame, Meshes, cast_people, compose, meshes, truth_of
 
 NOTE = (
     "Made, not measured: clothed bodies of anny 0.6.2, joints as in tools/make_sample (rotation centres of the "
@@ -30,16 +30,19 @@ NOTE = (
 
 
 def good_frame(sensor: Sensor, index: int) -> tuple[Frame, Meshes, Scene, list[dict[str, Any]], int]:
-    """The first composition that fits and shows at least one person well."""
+    """The first composition that fits and shows its people well enough: at most one in the dark, and seldom."""
+    cast = cast_people(sensor, index)
     for attempt in range(60):
-        frame = compose(sensor, index, attempt)
+        frame = compose(sensor, index, attempt, cast)
         if frame is None:
             continue
         mesh = meshes(frame)
         scene = Scene(mesh.vertices, mesh.faces)
         people = truth_of(frame, scene, mesh, sensor)
         seen = [sum(v and not o for v, o in zip(p["in_view"], p["occluded"], strict=True)) for p in people]
-        if max(seen) >= 8:
+        poor = sum(n < 4 for n in seen)
+        few = attempt < 40 and (float(np.mean(seen)) < 7.5 or poor > int(frame.rng.random() < 0.25))
+        if max(seen) >= 8 and not few:
             return frame, mesh, scene, people, attempt
     raise RuntimeError(f"{sensor.name} frame {index}: no composition fits")
 

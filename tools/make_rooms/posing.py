@@ -127,8 +127,7 @@ def self_contact(f: Fit, pos: Array) -> float:
     depth = 0.42 * (f.surface(f.hip + 0.2, True) - f.surface(f.hip + 0.2))
     centre = 0.5 * (f.surface(f.hip + 0.2, True) + f.surface(f.hip + 0.2))
     side = np.cross(top - hips, at("upperleg01.L") - at("upperleg01.R"))
-    shift = -centre * side / max(np.linalg.norm(side), 1e-6)
-    shift = shift if side[1] < 0 else shift
+    shift = centre * side / max(np.linalg.norm(side), 1e-6)
     worst = 0.0
     for s, o in (("L", "R"), ("R", "L")):
         elbow, wrist, knuckle = at(f"lowerarm01.{s}"), at(f"wrist.{s}"), at(f"finger3-1.{s}")

@@ -159,7 +159,7 @@ def stance(f: Fit, rng: Rng, arms: dict[str, Arm], spread: float = 1.0) -> Pose:
         xy = (s * wide, rng.uniform(-0.09, 0.07))
         feet[side] = Foot(xy, s * rng.uniform(0.0, 0.35))
     return Pose(
-        vec(rng.uniform(-0.04, 0.04), 0.0, f.hip - rng.uniform(0.004, 0.03)),
+        vec(rng.uniform(-0.04, 0.04), 0.0, f.hip - rng.uniform(-0.004, 0.006)),
         rng.uniform(-0.12, 0.12),
         feet,
         arms,
@@ -503,7 +503,9 @@ def reaching_high(f: Fit, rng: Rng) -> Setup:
     def things(f: Fit, rot: Array, pos: Array, posed: Array) -> list[Prop]:
         inner = np.random.default_rng(kid)
         g = grip_of(f, pos, side)
-        y = min(float(bone(f, pos, f"wrist.{side}")[1]) - 0.03, float(posed[posed[:, 2] < g[2] - 0.3][:, 1].min()) - 0.03)
+        y = min(
+            float(bone(f, pos, f"wrist.{side}")[1]) - 0.03, float(posed[posed[:, 2] < g[2] - 0.3][:, 1].min()) - 0.03
+        )
         board = g[2] - inner.uniform(0.07, 0.11)
         boards = [board]
         while boards[-1] > 0.45:
@@ -616,9 +618,9 @@ def carrying(f: Fit, rng: Rng) -> Setup:
     color = (0.42, 0.28, 0.16) if rng.random() < 0.5 else fu.bright(rng)
 
     def things(f: Fit, rot: Array, pos: Array, posed: Array) -> list[Prop]:
-        l, r = grip_of(f, pos, "L"), grip_of(f, pos, "R")
-        width = max(float(l[0] - r[0]) - 0.035, 0.12)
-        c = (0.5 * float(l[0] + r[0]), centre[1], 0.5 * float(l[2] + r[2]) + 0.2 * high)
+        left, right = grip_of(f, pos, "L"), grip_of(f, pos, "R")
+        width = max(float(left[0] - right[0]) - 0.035, 0.12)
+        c = (0.5 * float(left[0] + right[0]), centre[1], 0.5 * float(left[2] + right[2]) + 0.2 * high)
         return [fu.make("carried", c, (width, deep, high), "paint", color, 0.0, True)]
 
     return Setup(pose, pull={"L": 0.1, "R": 0.1}, things=things)
@@ -686,11 +688,12 @@ class Posed:
     facing: str
 
 
-def _settle(f: Fit, pose: Pose) -> None:
+def _settle(f: Fit, pose: Pose, rng: Rng) -> None:
     """Lower the hips until both feet can be reached."""
     b: Body = f.body
     half = b.head_of("upperleg01.L")[0]
-    for _ in range(30):
+    limit = f.leg * (0.9985 - 0.014 * rng.random() ** 2)
+    for _ in range(40):
         far = 0.0
         for side in "LR":
             _, ankle = place_foot(b, side, pose.feet[side])
@@ -698,16 +701,16 @@ def _settle(f: Fit, pose: Pose) -> None:
             k = signs(side) * half
             hip = pose.pelvis + vec(k * c, k * s, -k * np.sin(pose.roll))
             far = max(far, float(np.linalg.norm(ankle - hip)))
-        if far <= 0.994 * f.leg:
+        if far <= limit:
             return
-        pose.pelvis = pose.pelvis - vec(0, 0, 0.006)
+        pose.pelvis = pose.pelvis - vec(0, 0, 0.004)
 
 
 def make_posture(f: Fit, name: str, rng: Rng, tries: int = 24) -> Posed | None:
     """A posture of that name whose limbs keep out of the body and of the things that belong to it."""
     for _ in range(tries):
         setup = POSTURES[name](f, rng)
-        _settle(f, setup.pose)
+        _settle(f, setup.pose, rng)
         rot, pos = solve_pose(f.body, setup.pose, setup.lift, setup.pull)
         if not np.isfinite(pos).all() or self_contact(f, pos) > setup.touch:
             continue

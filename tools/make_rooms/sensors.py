@@ -160,7 +160,6 @@ def _azure(scene: Scene, pose: Array, s: Sensor, dark: Array, rng: Rng) -> Array
 def _realsense(scene: Scene, pose: Array, s: Sensor, dark: Array, rng: Rng) -> Array:
     """Active stereo with a 50 mm base: correlated noise, fat edges, shadows seen by one eye only."""
     shape = (s.depth_size[1], s.depth_size[0])
-    n = shape[0] * shape[1]
     base, f = 0.05, float(s.depth_k[0, 0])
     z, face, angle, rays = _view(scene, pose, s, None)
     hit = z > 0
@@ -210,7 +209,7 @@ def raw_depth(scene: Scene, color_pose: Array, s: Sensor, dark: Array, rng: Rng)
 def shaded_color(scene: Scene, pose: Array, s: Sensor, colors: Array, rng: Rng) -> NDArray[np.uint8]:
     """A plain picture (RGB): colours by surface, one light from above and one from the camera."""
     rays = pixel_rays(s.color_size, s.color_k) @ pose[:3, :3].T
-    z, face, normal = scene.cast(pose[:3, 3], rays)
+    _, face, normal = scene.cast(pose[:3, 3], rays)
     unit = rays / np.linalg.norm(rays, axis=1, keepdims=True)
     normal = normal * -np.sign((normal * unit).sum(1, keepdims=True))
     light = 0.30 + 0.35 * np.clip(-(normal * unit).sum(1), 0, 1)

@@ -90,17 +90,17 @@ def _prop_rects(props: list[Prop]) -> list[Rect]:
 
 
 def _place(
-    posed: Posed, rng: Rng, dist: float, fov: float, edge: bool, taken: list[Rect], near: list[float]
+    posed: Posed, rng: Rng, dist: float, fov: tuple[float, float], edge: bool, taken: list[Rect], near: list[float]
 ) -> tuple[float, Array, list[Rect]] | None:
     """Yaw and place for a person that does not run into what stands already."""
     local = [_rect(posed.skin), *_prop_rects(posed.props)]
     for _ in range(40):
         if edge:
-            bearing = float(rng.choice([-1, 1])) * 0.5 * fov * rng.uniform(0.86, 1.04)
+            bearing = float(rng.choice([-1, 1])) * 0.5 * rng.choice(fov) * rng.uniform(0.9, 1.1)
         elif near and rng.random() < 0.45:  # behind or before someone else, as the camera sees it
             bearing = near[int(rng.integers(len(near)))] + rng.normal(0, 0.14)
         else:
-            bearing = 0.5 * fov * rng.uniform(-0.82, 0.82)
+            bearing = 0.5 * min(fov) * rng.uniform(-0.85, 0.85)
         d = dist * rng.uniform(0.93, 1.07)
         xy = d * np.array([np.sin(bearing), np.cos(bearing)])
         to_camera = np.arctan2(-xy[1], -xy[0])  # direction to the camera; yaw 0 faces -y, an angle of -pi / 2
@@ -140,24 +140,38 @@ def plan(sensor: Sensor, index: int, attempt: int) -> tuple[list[str], int, Rng]
     while len(deck) < int(counts[: index + 1].sum()):
         deck += [names[k] for k in shuffle.permutation(len(names))]
     start = int(counts[:index].sum())
-    return deck[start : start + int(counts[index])], index, np.random.default_rng([SEED, len(sensor.name), index, attempt])
+    return (
+        deck[start : start + int(counts[index])],
+        index,
+        np.random.default_rng([SEED, len(sensor.name), index, attempt]),
+    )
 
 
-def compose(sensor: Sensor, index: int, attempt: int) -> Frame | None:
+def cast_people(sensor: Sensor, index: int) -> list[Dressed]:
+    """The people of a frame, the same in every attempt."""
+    names = plan(sensor, index, 0)[0]
+    seeds = [[SEED, len(sensor.name), index, 2000 + k] for k in range(len(names))]
+    return [make_dressed(np.random.default_rng(seed), f"P{k}") for k, seed in enumerate(seeds)]
+
+
+def compose(sensor: Sensor, index: int, attempt: int, people: list[Dressed]) -> Frame | None:
     """People, furniture, room and camera of a frame; None where it does not fit together."""
     names, _, rng = plan(sensor, index, attempt)
-    fov = 2 * np.arctan(0.5 * sensor.color_size[0] / sensor.color_k[0, 0])
+    fov = tuple(
+        float(2 * np.arctan(0.5 * size[0] / k[0, 0]))
+        for size, k in ((sensor.color_size, sensor.color_k), (sensor.depth_size, sensor.depth_k))
+    )
     actors: list[Actor] = []
     camera: Rect = (np.zeros(2), np.array([0.28, 0.28]), 0.0)
     taken, near = [camera], []
     height = float(rng.uniform(0.8, 2.2))
-    dists = rng.uniform(1.25, 5.2, len(names))
+    dists = 1.2 + 4.2 * rng.random(len(names)) ** 1.25
     for k, name in enumerate(names):
-        dressed = make_dressed(rng, f"P{k}")
+        dressed = people[k]
         posed = make_posture(fit(dressed.body), name, rng)
         if posed is None:
             return None
-        edge = bool(rng.random() < 0.13)
+        edge = bool(rng.random() < 0.2)
         spot = None
         for step in range(4):
             dist = float(dists[k]) if step < 2 else float(rng.uniform(1.4, 5.3))
@@ -181,7 +195,7 @@ def compose(sensor: Sensor, index: int, attempt: int) -> Frame | None:
     if any(_hits(p, [b for b in actors if b is not a]) for a in actors for p in a.props()):
         return None
     for a in actors:  # things that hide a part of a person
-        if rng.random() < 0.38:
+        if rng.random() < 0.3:
             group = fu.occluder(rng)
             d = float(np.linalg.norm(a.xy))
             gap = rng.uniform(0.5, 1.1)
@@ -216,6 +230,8 @@ def compose(sensor: Sensor, index: int, attempt: int) -> Frame | None:
         c = np.concatenate([_corners(r) for r in rects])
         if (c < [x0 - 0.01, y0 - 0.01]).any() or (c > [x1 + 0.01, y1 + 0.01]).any():
             continue
+        if max(p.vertices[:, 2].max() for p in moved) > 1.2 and np.linalg.norm(c, axis=1).min() < 2.0:
+            continue  # it would fill the picture
         if not _clash(rects, taken, 0.03) and not any(_hits(p, actors) for p in moved):
             props += moved
             taken += rects
@@ -224,7 +240,7 @@ def compose(sensor: Sensor, index: int, attempt: int) -> Frame | None:
     main = actors[0]
     d = float(np.linalg.norm(main.xy))
     aim = float(rng.uniform(0.55, 0.75)) * float(main.skin[:, 2].max())
-    pitch = float(np.clip(np.arctan2(height - aim, d) * rng.uniform(0.75, 1.1) + rng.normal(0, 0.04), -0.16, 0.7))
+    pitch = float(np.clip(np.arctan2(height - aim, d) * rng.uniform(0.75, 1.1) + rng.normal(0, 0.07), -0.2, 0.75))
     pose = camera_pose(height, pitch, float(rng.normal(0, 0.015)))
     return Frame(actors, props, pose, rng)
 
@@ -245,7 +261,9 @@ def meshes(frame: Frame) -> Meshes:
     """Skin all clothes and gather the triangles."""
     vertices, faces, owner, dark, color, parts, n = [], [], [], [], [], [], 0
 
-    def add(name: str, v: Array, f: Any, who: int, shade: float, tint: Array, material: str, piece: Piece | None) -> None:
+    def add(
+        name: str, v: Array, f: Any, who: int, shade: float, tint: Array, material: str, piece: Piece | None
+    ) -> None:
         nonlocal n
         vertices.append(v)
         faces.append(f + n)

@@ -10,7 +10,7 @@ from bodies import Body
 from clothes import face_colors, pattern_st, regions, shell, shoe
 from common import Array
 from layout import Person
-from meshes import Mask, Piece, adjacency, grid_faces, smooth, submesh, subdivide
+from meshes import Mask, Piece, adjacency, grid_faces, smooth, subdivide, submesh
 from scipy.spatial import ConvexHull, cKDTree
 
 

@@ -82,7 +82,7 @@ class BlazePoseDetector:
     name = "blazepose"
 
     def __init__(self, min_score: float = 0.5, threads: int = 2):
-        """min_score: least probability that a region holds a person. threads: that work on a network."""
+        """min_score: least probability that a region holds a person. threads: networks that run at a time."""
         self.min_score = min_score
         self._nets = BlazePoseNets(model_path("pose_detection"), model_path("pose_landmark_full"), threads)
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
-from typing import Final, Literal, cast
+from typing import Final
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -32,7 +32,7 @@ REGIONS: Final = (
 REGION: Final = MappingProxyType({name: i for i, name in enumerate(REGIONS)})
 """Name -> code in `BodyBank.region`."""
 
-VERSION: Final = 2
+VERSION: Final = 4
 """of the cached banks; to be raised whenever the same seed gives other bodies"""
 
 _FACE_ROWS = [JOINT[n] for n in ("nose", "right_eye", "left_eye", "right_ear", "left_ear")]
@@ -74,8 +74,10 @@ class BodyBank:
     region: Int[Tensor, " p"]
     """codes, see REGION"""
     along: Float[Tensor, " p"]
-    """0..1 along the region: limbs from the trunk outward, hand wrist to finger tips, foot heel to toes; trunk_lower from
-    the crotch to the chest's origin, trunk_upper from there to the neck's origin; neck upward, head from chin to crown"""
+    """0..1 along the region: limbs from the trunk outward, hand wrist to finger tips, foot heel to toes; trunk_lower
+    from the crotch to the chest's origin, trunk_upper on to the neck's origin; neck upward, head from chin to crown"""
+    drape: Float[Tensor, "n p"]
+    """trunk: how far along the normal cloth lies that is taut around the trunk at that height, metres; elsewhere 0"""
     stature: Float[Tensor, " n"]
     """metres, barefoot"""
     female: Bool[Tensor, " n"]
@@ -127,9 +129,12 @@ class BodyBank:
     def select(self, indices: Tensor | Sequence[int]) -> BodyBank:
         """A bank of some of the bodies."""
         rows = torch.as_tensor(indices, device=self.device)
-        per_body = ("points", "normals", "origins", "align", "joints", "stature", "female")
+        per_body = ("points", "normals", "origins", "align", "joints", "drape", "stature", "female")
         return BodyBank(
-            **{f.name: getattr(self, f.name)[rows] if f.name in per_body else getattr(self, f.name) for f in fields(self)}
+            **{
+                f.name: getattr(self, f.name)[rows] if f.name in per_body else getattr(self, f.name)
+                for f in fields(self)
+            }
         )
 
     def save(self, path: Path) -> None:
@@ -179,7 +184,10 @@ def pose(
     joints = _joints(bank.joints[ids], rest, origins, total)
 
     turn = torch.cat([total, _helpers(rotations, align, total)], 1)
-    main = [*range(len(SEGMENTS)), *(SEGMENT[f"{s}_{p}"] for p in ("upper_arm", "forearm") for s in _SIDES for _ in "ab")]
+    main = [
+        *range(len(SEGMENTS)),
+        *(SEGMENT[f"{s}_{p}"] for p in ("upper_arm", "forearm") for s in _SIDES for _ in "ab"),
+    ]
     shift = origins[:, main] - (turn @ rest[:, main, :, None])[..., 0]
     blended = bank.helper_weights @ torch.cat([turn.mT, shift[:, :, None]], 2).flatten(2)  # (B, P, 12): columns
     columns = blended.unflatten(2, (4, 3)).unbind(2)
@@ -223,9 +231,7 @@ def _helpers(rotations: Tensor, align: Tensor, total: Tensor) -> Tensor:
         own = [SEGMENT[f"{s}_{part}"] for s in _SIDES]
         other = [SEGMENT[f"{s}_{reference}"] for s in _SIDES]
         relative = rotations[:, own].mT @ total[:, other] @ align[:, own].mT  # identity at rest
-        angle = torch.atan2(
-            relative[..., 2, 1] - relative[..., 1, 2], relative[..., 1, 1] + relative[..., 2, 2] + 1e-9
-        )
+        angle = torch.atan2(relative[..., 2, 1] - relative[..., 1, 2], relative[..., 1, 1] + relative[..., 2, 2] + 1e-9)
         angle = angle[..., None] * torch.tensor(_TWIST_SHARES, device=angle.device)
         out.append(rotations[:, own, None] @ _about_x(angle) @ align[:, own, None])
     return torch.stack(out, 1).flatten(1, 3)
@@ -278,7 +284,7 @@ def pose_extra(
     return _apply(matrix.unbind(3), local) + origins.gather(1, index)
 
 
-def load_bank(kind: Literal["anny", "capsules"], n: int, seed: int, cache: Path | None = None) -> BodyBank:
+def load_bank(kind: str, n: int, seed: int, cache: Path | None = None) -> BodyBank:
     """A bank from the cache, built when it is not there yet.
 
     kind: `anny` (needs the package of that name to build) or `capsules`. cache: folder, default
@@ -299,11 +305,11 @@ def anny_bank(n: int, seed: int, points: int = 9000) -> BodyBank:
     """n adults of the parametric body model anny; see `body_anny.build`."""
     from understudy.synthetic.body_anny import build
 
-    return cast(BodyBank, build(n, seed, points))
+    return build(n, seed, points)
 
 
 def capsule_bank(n: int, seed: int, points: int = 9000) -> BodyBank:
     """n adults of tapered tubes and boxes with the proportions of ANSUR II; see `body_capsules.build`."""
     from understudy.synthetic.body_capsules import build
 
-    return cast(BodyBank, build(n, seed, points))
+    return build(n, seed, points)

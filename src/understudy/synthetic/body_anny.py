@@ -12,7 +12,7 @@ from understudy.skeleton import JOINT
 from understudy.synthetic.ansur import bones, draw_lengths, draw_sex, draw_stature
 from understudy.synthetic.bodies import BodyBank
 from understudy.synthetic.segments import JOINT_SEGMENT, PARENTS, SEGMENT, SEGMENTS
-from understudy.synthetic.surface import SIDES, alignment, even_samples, regions, vertex_normals
+from understudy.synthetic.surface import SIDES, alignment, drape, even_samples, regions, vertex_normals
 
 HIDDEN = ("eye_back.L", "eye_back.R", "eye_cavity.L", "eye_cavity.R", "mouth_cavity", "tongue")
 """Parts of the mesh inside the head."""
@@ -88,21 +88,27 @@ def build(n: int, seed: int, points: int) -> BodyBank:
         origins.append(o)
         joints.append(_joints(o, coco))
         palms.append(torch.stack([_palm(model, heads, s) for s in "RL"], 1))
-        tips.append(torch.stack([_heads(model, heads, *(f"finger{k}-3.{s}" for k in (2, 3, 4, 5))).mean(1) for s in "RL"], 1))
-        toes.append(torch.stack([coco[f"{s}_big_toe"] + coco[f"{s}_small_toe"] - 2 * coco[f"{s}_heel"] for s, _ in SIDES], 1))
+        tips.append(
+            torch.stack([_heads(model, heads, *(f"finger{k}-3.{s}" for k in (2, 3, 4, 5))).mean(1) for s in "RL"], 1)
+        )
+        toes.append(
+            torch.stack([coco[f"{s}_big_toe"] + coco[f"{s}_small_toe"] - 2 * coco[f"{s}_heel"] for s, _ in SIDES], 1)
+        )
     o, j, p = torch.cat(origins), torch.cat(joints), torch.cat(spots)
     fingers, palm = torch.cat(tips), torch.cat(palms)
     p, o, j, fingers = _with_lengths(p, weights, o, j, fingers, bones(draw_lengths(female, stature, generator)))
     region, along = regions(p.mean(0), weights, o.mean(0), j.mean(0))
+    normals = torch.cat(directions)
     return BodyBank(
         points=p,
-        normals=torch.cat(directions),
+        normals=normals,
         weights=weights,
         origins=o,
         align=alignment(o, palm, fingers, torch.cat(toes)),
         joints=j,
         region=region,
         along=along,
+        drape=drape(p, normals, region),
         stature=stature,
         female=female,
     )

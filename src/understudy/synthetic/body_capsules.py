@@ -19,7 +19,7 @@ from understudy.skeleton import JOINT
 from understudy.synthetic.ansur import bones, draw_lengths, draw_sex, draw_stature
 from understudy.synthetic.bodies import BodyBank
 from understudy.synthetic.segments import JOINT_SEGMENT, SEGMENT, SEGMENTS
-from understudy.synthetic.surface import SIDES, alignment, even_samples, regions, vertex_normals
+from understudy.synthetic.surface import SIDES, alignment, drape, even_samples, regions, vertex_normals
 
 COLUMNS = 28
 """Vertices around a ring."""
@@ -141,7 +141,11 @@ def build(n: int, seed: int, points: int) -> BodyBank:
     for part, spots in zip(parts, mean, strict=True):
         centre = spots[one].mean(1)
         others = [q for q in parts if q is not part and q.segment in ("chest", "neck", "head")]
-        keep.append(~torch.stack([q.contains(centre, 0.012) for q in others]).any(0))
+        inside = torch.stack([q.contains(centre, 0.012) for q in others]).any(0)
+        if part.segment == "chest":  # the trunk's edge inside the ball of the shoulder
+            balls = origins.mean(0)[[SEGMENT["right_upper_arm"], SEGMENT["left_upper_arm"]]]
+            inside |= torch.cdist(centre, balls).amin(1) < 0.047
+        keep.append(~inside)
     face, bary = even_samples(torch.cat(mean), faces, torch.cat(keep).float(), points, generator)
     corner = faces[face]
     every = torch.cat(vertices, 1)
@@ -149,16 +153,18 @@ def build(n: int, seed: int, points: int) -> BodyBank:
     spots = (every[:, corner] * bary[..., None]).sum(2)
     weights = (weights[corner] * bary[..., None]).sum(1)
     region, along = regions(spots.mean(0), weights, origins.mean(0), joints.mean(0))
+    normals = torch.nn.functional.normalize((normal[:, corner] * bary[..., None]).sum(2), dim=2)
     tilt = torch.stack([_arm(s)[:, 1] for _, s in SIDES])  # the palms look down when the arms are level
     return BodyBank(
         points=spots,
-        normals=torch.nn.functional.normalize((normal[:, corner] * bary[..., None]).sum(2), dim=2),
+        normals=normals,
         weights=weights,
         origins=origins,
         align=alignment(origins, -tilt.expand(n, 2, 3), tips, torch.tensor([0.0, -1.0, 0.0]).expand(n, 2, 3)),
         joints=joints,
         region=region,
         along=along,
+        drape=drape(spots, normals, region),
         stature=stature,
         female=female,
     )
@@ -221,7 +227,7 @@ def people(
     upright = torch.eye(3).expand(n, 3, 3)
 
     # trunk: from the crotch to the root of the neck
-    low, high = -0.085 * size, acromion + 0.02
+    low, high = -0.085 * size, acromion + 0.055
     hip, waist, chest = (
         sexed(0.172, 0.174) * trunk * vary(0.03),
         sexed(0.150, 0.132) * (build_ * 1.1).exp() * size * vary(0.04),
@@ -236,17 +242,36 @@ def people(
             at(0, 0, low),
             upright,
             high - low,
-            (0.0, 0.13, 0.28, 0.45, 0.68, 0.80, 0.90, 0.96, 1.0),
-            knots(hip * 0.72, hip, hip * 0.93, waist, chest, torch.maximum(chest, shoulder), shoulder, shoulder * 0.72, 0.07 * size),
+            (0.0, 0.12, 0.27, 0.43, 0.65, 0.78, 0.86, 0.92, 0.96, 1.0),
+            knots(
+                hip * 0.72,
+                hip,
+                hip * 0.93,
+                waist,
+                chest,
+                torch.maximum(chest, shoulder),
+                shoulder * 1.06,
+                shoulder * 0.86,
+                shoulder * 0.52,
+                0.062 * size,
+            ),
             knots(
                 *(d * deep for d in (0.088, 0.118, 0.120, 0.108)),
                 0.116 * deep + breast / 2,
                 0.104 * deep + breast / 4,
-                0.086 * (deep * size) ** 0.5,
-                0.070 * size,
-                0.058 * size,
+                0.090 * (deep * size) ** 0.5,
+                0.074 * size,
+                0.064 * size,
+                0.057 * size,
             ),
-            knots(0.012 * size, 0.012 * size, -belly / 2, -belly, -breast / 2, 0.0 * size + 0.008, 0.012 * size, 0.016 * size, 0.018 * size),
+            knots(
+                0.012 * size,
+                0.012 * size,
+                -belly / 2,
+                -belly,
+                -breast / 2,
+                *(v * size for v in (0.008, 0.010, 0.014, 0.017, 0.018)),
+            ),
             caps=(0.45, 0.35),
             power=2.4,
         )
@@ -307,7 +332,9 @@ def people(
         wide, thin = (knots(*(v * h for v in row)) for row in ((0.029, 0.040, 0.044), (0.020, 0.017, 0.014)))
         parts.append(Part(f"{side}_hand", w, frame, palm, (0.0, 0.4, 1.0), wide, thin, zero, (0.3, 0.3), 2.8))
         wide, thin = (knots(*(v * h for v in row)) for row in ((0.043, 0.040, 0.026), (0.012, 0.010, 0.007)))
-        parts.append(Part(f"{side}_fingers", k, frame, finger * 0.95, (0.0, 0.5, 1.0), wide, thin, zero, (0.3, 0.5), 3.0))
+        parts.append(
+            Part(f"{side}_fingers", k, frame, finger * 0.95, (0.0, 0.5, 1.0), wide, thin, zero, (0.3, 0.5), 3.0)
+        )
         thumb = _frame(up, out * 0.75 - back * 0.6 - up * 0.25)
         root = w + (0.02 * h)[:, None] * out - (0.022 * h)[:, None] * back
         ball = knots(0.016 * h, 0.013 * h, 0.010 * h)
@@ -324,12 +351,24 @@ def people(
         r = limb * sexed(1.0, 1.02) * vary(0.04)
         wide = knots(*(v * r for v in (0.088, 0.086, 0.064, 0.056)))
         back_of = knots(*(v * r for v in (0.010, 0.004, 0.0, 0.0)))
-        parts.append(Part(f"{side}_thigh", hip_o, leg.expand(n, 3, 3), thigh, (0.0, 0.3, 0.8, 1.0), wide, wide * 1.02, back_of))
+        parts.append(
+            Part(f"{side}_thigh", hip_o, leg.expand(n, 3, 3), thigh, (0.0, 0.3, 0.8, 1.0), wide, wide * 1.02, back_of)
+        )
         r = limb * sexed(1.0, 0.97) * vary(0.04)
         wide = knots(*(v * r for v in (0.054, 0.058, 0.050, 0.035, 0.034)))
         calf = knots(*(v * r for v in (0.0, 0.016, 0.014, 0.004, 0.004)))
         parts.append(
-            Part(f"{side}_shin", knee, leg.expand(n, 3, 3), shin, (0.0, 0.28, 0.5, 0.85, 1.0), wide, wide * 1.03, calf, (1.0, 0.7))
+            Part(
+                f"{side}_shin",
+                knee,
+                leg.expand(n, 3, 3),
+                shin,
+                (0.0, 0.28, 0.5, 0.85, 1.0),
+                wide,
+                wide * 1.03,
+                calf,
+                (1.0, 0.7),
+            )
         )
         f = sexed(0.271, 0.246) * size * vary(0.02)
         tall = knots(0.040 * size, 0.045 * size, 0.024 * size, 0.014 * size)

@@ -13,7 +13,7 @@ from understudy.synthetic.bodies import REGION, BodyBank
 from understudy.synthetic.segments import SEGMENT
 
 THINGS: Final = ("nothing", "backpack", "shoulder_bag", "box_right", "box_left", "box_both")
-"""Names of the codes. `box_both` is rigid to the right hand and reaches from its palm to where the left palm should be."""
+"""Names of the codes. `box_both` is rigid to the right hand and reaches from its palm to where the left one belongs."""
 
 N_THING, N_BRIM = 1280, 128
 N_EXTRA: Final = N_THING + N_BRIM
@@ -38,11 +38,25 @@ def carry(
     n, device = len(ids), bank.device
     random = torch.rand(4, n, 3, generator=generator, device=generator.device).to(device)
     low = torch.tensor(
-        [[0.0, 0.0, 0.0], [0.26, 0.12, 0.36], [0.08, 0.24, 0.20], [0.06, 0.05, 0.05], [0.06, 0.05, 0.05], [0.15, 0.1, 0.22]],
+        [
+            [0.0, 0.0, 0.0],
+            [0.26, 0.12, 0.36],
+            [0.08, 0.24, 0.20],
+            [0.06, 0.05, 0.05],
+            [0.06, 0.05, 0.05],
+            [0.15, 0.1, 0.22],
+        ],
         device=device,
     )
     high = torch.tensor(
-        [[0.0, 0.0, 0.0], [0.36, 0.26, 0.55], [0.18, 0.42, 0.34], [0.26, 0.22, 0.25], [0.26, 0.22, 0.25], [0.40, 0.4, 0.50]],
+        [
+            [0.0, 0.0, 0.0],
+            [0.36, 0.26, 0.55],
+            [0.18, 0.42, 0.34],
+            [0.26, 0.22, 0.25],
+            [0.26, 0.22, 0.25],
+            [0.40, 0.4, 0.50],
+        ],
         device=device,
     )
     size = torch.lerp(low[carried], high[carried], random[0])
@@ -71,11 +85,17 @@ def _places(
     half, zero = size / 2, torch.zeros(n, device=device)
     neck = bank.origins[ids, SEGMENT["neck"]]
     back = spots[..., 1].amax(1) + 0.6 * clothes
-    pack = torch.stack([zero, back + half[:, 1] - 0.015, neck[:, 2] - 0.02 - half[:, 2] + 0.06 * (random[:, 0] - 0.5)], 1)
+    pack = torch.stack(
+        [zero, back + half[:, 1] - 0.015, neck[:, 2] - 0.02 - half[:, 2] + 0.06 * (random[:, 0] - 0.5)], 1
+    )
     side = torch.where(random[:, 0] < 0.5, -1.0, 1.0)
     hips = spots[..., 0].abs().amax(1) * 0.9 + clothes
     bag = torch.stack([side * (hips + half[:, 0]), 0.1 * (random[:, 1] - 0.5), -0.1 + 0.25 * random[:, 2]], 1)
-    centres, turns, segments = [zero[:, None].expand(-1, 3), pack, bag], [torch.eye(3, device=device).expand(n, 3, 3)] * 3, [0, 2, 0]
+    centres, turns, segments = (
+        [zero[:, None].expand(-1, 3), pack, bag],
+        [torch.eye(3, device=device).expand(n, 3, 3)] * 3,
+        [0, 2, 0],
+    )
     segments = [SEGMENT["pelvis"], SEGMENT["chest"], SEGMENT["pelvis"]]
     for hand, sign in (("right_hand", -1.0), ("left_hand", 1.0), ("right_hand", -1.0)):
         # canonical: out along the hand, across it, out of the palm

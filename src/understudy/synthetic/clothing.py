@@ -112,13 +112,22 @@ def draw_style(bank: BodyBank, ids: Int[Tensor, " b"], generator: torch.Generato
     zero = torch.zeros(n, device=device)
     top = kinds(0.16, 0.30, 0.28, 0.18, 0.08)  # tight, T-shirt, long sleeves, jacket, coat
     u = between(0.0, 1.0)
-    sleeve = pick(top, *(low + (high - low) * u for low, high in ((0.0, 1.9), (0.3, 0.9), (1.1, 1.97), (1.8, 2.0), (1.85, 2.0))))
-    u = between(0.0, 1.0)
-    thick = pick(
-        top, *(low + (high - low) * u for low, high in ((0.002, 0.006), (0.006, 0.022), (0.007, 0.026), (0.02, 0.05), (0.025, 0.05)))
+    sleeve = pick(
+        top, *(low + (high - low) * u for low, high in ((0.0, 1.9), (0.3, 0.9), (1.1, 1.97), (1.8, 2.0), (1.85, 2.0)))
     )
     u = between(0.0, 1.0)
-    hem = pick(top, *(low + (high - low) * u for low, high in ((-0.5, 0.0), (-0.4, 0.1), (-0.4, 0.15), (-0.4, 0.25), (0.6, 1.1))))
+    thick = pick(
+        top,
+        *(
+            low + (high - low) * u
+            for low, high in ((0.002, 0.006), (0.006, 0.022), (0.007, 0.026), (0.02, 0.05), (0.025, 0.05))
+        ),
+    )
+    u = between(0.0, 1.0)
+    hem = pick(
+        top,
+        *(low + (high - low) * u for low, high in ((-0.5, 0.0), (-0.4, 0.1), (-0.4, 0.15), (-0.4, 0.25), (0.6, 1.1))),
+    )
     skirt = chance(torch.where(female, 0.22, 0.01))
     legs = kinds(0.34, 0.46, 0.20)  # tight, loose, shorts
     u = between(0.0, 1.0)
@@ -150,7 +159,7 @@ def draw_style(bank: BodyBank, ids: Int[Tensor, " b"], generator: torch.Generato
         bun=chance(torch.where(female, 0.22, 0.01)) & ~long_hair & ~bald,
         hat=hat,
         scarf=torch.where(chance(0.08), between(0.02, 0.05), zero),
-        belly=torch.where(chance(0.2), between(0.01, 0.09), zero),
+        belly=torch.where(chance(0.2), between(0.01, 0.06), zero),
         carried=kinds(0.70, 0.10, 0.06, 0.05, 0.04, 0.05),
         dark_hair=chance(0.5),
         dark_top=chance(0.15),
@@ -159,9 +168,7 @@ def draw_style(bank: BodyBank, ids: Int[Tensor, " b"], generator: torch.Generato
     )
 
 
-def dress(
-    bank: BodyBank, ids: Int[Tensor, " b"], generator: torch.Generator, style: Style | None = None
-) -> Dressed:
+def dress(bank: BodyBank, ids: Int[Tensor, " b"], generator: torch.Generator, style: Style | None = None) -> Dressed:
     """Dresses bodies of the bank at rest. style: what they wear, default drawn at random."""
     style = style or draw_style(bank, ids, generator)
     points, normals = bank.points[ids], bank.normals[ids]
@@ -170,7 +177,7 @@ def dress(
     masks = {name: bank.region == code for name, code in REGION.items()}
 
     top_on, bottom_on = _covers(masks, low, arm, wear)
-    thick = _thickness(bank, masks, low, wear, top_on, bottom_on, points, normals)
+    thick = _thickness(bank, masks, low, wear, top_on, bottom_on, points, normals, bank.drape[ids])
     thick, normals = _fold(points, normals, thick, top_on | bottom_on, style.folds, generator)
     out = torch.addcmul(points, normals, thick[..., None])
     hair_on = _hair(bank, ids, masks, style, points, out)
@@ -216,6 +223,7 @@ def _thickness(
     bottom_on: Tensor,
     points: Tensor,
     normals: Tensor,
+    hollow: Tensor,
 ) -> Tensor:
     """(B, P) thickness of the clothes, metres; hair and shoes are not in it."""
     arms = masks["upper_arm"] | masks["forearm"]
@@ -225,8 +233,12 @@ def _thickness(
     lower = wear["bottom"] + wear["flare"] * low.clamp(0, 2)
     lower = torch.where(masks["trunk_lower"], 0.4 * wear["bottom"].clamp(max=0.015), lower)
     thick = torch.where(top_on, upper, 0.0)
-    thick = torch.where(bottom_on & top_on, torch.maximum(thick, lower + 0.25 * thick), thick + torch.where(bottom_on, lower, 0.0))
-    paunch = (-normals[..., 1]).clamp_min(0) * torch.exp(-(((points[..., 2] - 0.11) / 0.09) ** 2))
+    thick = torch.where(
+        bottom_on & top_on, torch.maximum(thick, lower + 0.25 * thick), thick + torch.where(bottom_on, lower, 0.0)
+    )
+    taut = (wear["top"] / 0.012).clamp(0.3, 0.95) * top_on + 0.5 * (bottom_on & ~top_on)
+    thick = thick + taut * hollow
+    paunch = (-normals[..., 1]).clamp_min(0) * torch.exp(-(((points[..., 2] - 0.11) / 0.13) ** 2))
     thick = thick + torch.where(masks["trunk_lower"], wear["belly"] * paunch, 0.0)
     return thick + torch.where(masks["neck"], wear["scarf"], 0.0)
 
@@ -251,9 +263,7 @@ def _fold(
     return thick + deep * height, bent * bent.square().sum(2, keepdim=True).rsqrt_()
 
 
-def _hair(
-    bank: BodyBank, ids: Tensor, masks: dict[str, Tensor], style: Style, points: Tensor, out: Tensor
-) -> Tensor:
+def _hair(bank: BodyBank, ids: Tensor, masks: dict[str, Tensor], style: Style, points: Tensor, out: Tensor) -> Tensor:
     """Moves the points of the head in place; returns (B, P) where hair or a hat is."""
     on = torch.zeros(points.shape[:2], dtype=torch.bool, device=points.device)
     picked = (masks["scalp"] | masks["neck"] | masks["trunk_upper"]).nonzero()[:, 0]
@@ -263,7 +273,7 @@ def _hair(
     joints = bank.joints[ids]
     ear = joints[:, [JOINT["right_ear"], JOINT["left_ear"]]].mean(1)
     crown_up = ((p[..., 2] - ear[:, None, 2]) / 0.12).clamp(0, 1)
-    behind = ((p[..., 1] - ear[:, None, 1]) / 0.03 + 1.0).clamp(0, 1)
+    behind = ((p[..., 1] - ear[:, None, 1]) / 0.05 + 0.5).clamp(0, 1)
 
     shift = style.hair[:, None] * (0.35 + 0.65 * crown_up)
     hat = style.hat[:, None]
@@ -286,7 +296,11 @@ def _hair(
     moved[..., :2] += flat * grow[..., None]
     cape = back & reached & (radius < 0.13) & (p[..., 1] > axis[..., 1] - 0.02)
     moved += normal * (0.022 * cape * behind)[..., None]
-    out[:, picked] = torch.where((scalp | ring | cape)[..., None], torch.where(scalp[:, None], moved, moved + (out[:, picked] - p)), out[:, picked])
+    out[:, picked] = torch.where(
+        (scalp | ring | cape)[..., None],
+        torch.where(scalp[:, None], moved, moved + (out[:, picked] - p)),
+        out[:, picked],
+    )
     on[:, picked] = (scalp & (style.hair > 0)[:, None]) | (ring | cape) & (behind > 0.3)
     return on
 
@@ -329,7 +343,10 @@ def _skirts(
         return
     rows = wearers[:, None]
     skirt = style.skirt[wearers]
-    hem = torch.maximum(torch.where(skirt, style.bottom_hem[wearers], -1.0), torch.where(style.coat[wearers], style.top_hem[wearers], -1.0))
+    hem = torch.maximum(
+        torch.where(skirt, style.bottom_hem[wearers], -1.0),
+        torch.where(style.coat[wearers], style.top_hem[wearers], -1.0),
+    )
     thick = torch.where(style.coat[wearers], style.top[wearers], style.bottom[wearers])
     flare = torch.where(skirt, style.flare[wearers], 0.03)
     size = (bank.stature[ids[wearers]] / 1.7)[:, None]
@@ -343,8 +360,10 @@ def _skirts(
             t = bank.along[picked][None, :, None]
             local = (points[rows, picked] - start - t * axis) @ align.mT  # canonical: x to the left, y back, z up
             u, w = sign * local[..., 0], local[..., 1]  # outward, back
-            r = (u.square() + w.square()).sqrt().clamp_min(1e-3)
-            tube = torch.maximum(r + thick[:, None], 0.082 * size + thick[:, None] + flare[:, None] * low[picked].clamp(0, 1.3))
+            r = (u.square() + w.square()).sqrt().clamp_min(1e-6)
+            tube = torch.maximum(
+                r + thick[:, None], 0.082 * size + thick[:, None] + flare[:, None] * low[picked].clamp(0, 1.3)
+            )
             inner = u < 0
             u_new = torch.where(inner, 0.0, u / r)
             w_new = torch.where(inner, torch.where(w < 0, -1.0, 1.0), w / r)

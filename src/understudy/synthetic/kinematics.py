@@ -1,4 +1,4 @@
-"""Geometry of the simulated skeleton: rotations, a mean stick figure, two-bone inverse kinematics, limits, interpolation.
+"""Geometry of the simulated skeleton: rotations, a mean stick figure, inverse kinematics, limits, interpolation.
 
 All in the body frame of `segments.py` (x to the person's left, y to the back, z up). Batches have any leading shape.
 """
@@ -24,7 +24,8 @@ SHOULDER: Final = (0.16, 0.0, 0.0)  # from the left clavicle's origin, along the
 HAND: Final = 0.17  # wrist to finger tips
 
 _SIDED = {
-    "clavicle": ("chest", (0.02, 0.0, 0.22)), "upper_arm": ("clavicle", SHOULDER), "forearm": ("upper_arm", (UPPER_ARM, 0, 0)),
+    "clavicle": ("chest", (0.02, 0.0, 0.22)), "upper_arm": ("clavicle", SHOULDER),
+    "forearm": ("upper_arm", (UPPER_ARM, 0, 0)),
     "hand": ("forearm", (FOREARM, 0, 0)), "fingers": ("hand", (0.09, 0, 0)), "thigh": ("pelvis", (HIP_HALF, 0, 0)),
     "shin": ("thigh", (0, 0, -THIGH)), "foot": ("shin", (0, 0, -SHIN)),
 }  # fmt: skip
@@ -176,7 +177,8 @@ def _relative(rotations: Tensor, child: str, parent: str) -> Tensor:
     return rotations[..., SEGMENT[parent], :, :].mT @ rotations[..., SEGMENT[child], :, :]
 
 
-def _angle(rotation: Tensor) -> Tensor:
+def angle_of(rotation: Tensor) -> Tensor:
+    """[..., 3, 3] -> how far it turns, radians."""
     trace = rotation[..., 0, 0] + rotation[..., 1, 1] + rotation[..., 2, 2]
     return ((trace - 1) / 2).clamp(-1, 1).acos()
 
@@ -193,33 +195,31 @@ def limit_excess(rotations: Float[Tensor, "*b 21 3 3"]) -> dict[str, Tensor]:
         "trunk_bend": beyond(_bend_about_x(trunk), -40, 95),
         "trunk_lean": beyond(torch.asin(trunk[..., 0, 2].clamp(-1, 1)), -50, 50),
         "trunk_twist": beyond(_turn_about_z(trunk), -60, 60),
-        "head": beyond(_angle(head), 0, 95),
+        "head": beyond(angle_of(head), 0, 95),
         "head_nod": beyond(_bend_about_x(head), -75, 75),
         "head_turn": beyond(_turn_about_z(head), -85, 85),
     }
-    flipped = mirror(rotations)
-    for side, pose in (("right", rotations), ("left", flipped)):  # everything below is written for the right side
-        upper = _relative(pose, "right_upper_arm", "chest")
-        out[f"{side}_shoulder"] = shoulder_excess(-upper[..., 0], twist_x(upper))
-        fore = _relative(pose, "right_forearm", "right_upper_arm")
-        # forearm along -x: in front (-y) when bent; it must stay in the hinge's plane, whatever its pronation
-        bend = torch.atan2(fore[..., 1, 0], fore[..., 0, 0])
-        out[f"{side}_elbow"] = beyond(bend, -12, 155) + beyond(torch.asin(fore[..., 2, 0].clamp(-1, 1)), -20, 20)
-        thigh = _relative(pose, "right_thigh", "pelvis")
-        down = -thigh[..., 2]
-        flex = torch.atan2(-down[..., 1], -down[..., 2])
-        flex = torch.where(flex < -2.5, flex + 2 * math.pi, flex)
-        out[f"{side}_hip"] = beyond(flex, -50, 160) * (down[..., 0].abs() < 0.95) + (
-            beyond(torch.asin(-down[..., 0].clamp(-1, 1)), -45, 85)
-        )
-        knee = _relative(pose, "right_shin", "right_thigh")
-        out[f"{side}_knee"] = beyond(_bend_about_x(knee), -8, 160) + beyond(
-            torch.asin(knee[..., 0, 2].clamp(-1, 1)), -20, 20
-        )
-        ankle = _relative(pose, "right_foot", "right_shin")
-        out[f"{side}_ankle"] = beyond(_angle(ankle), 0, 75)
-        out[f"{side}_wrist"] = beyond(_angle(_relative(pose, "right_hand", "right_forearm")), 0, 105)
-        out[f"{side}_clavicle"] = beyond(_angle(_relative(pose, "right_clavicle", "chest")), 0, 50)
+    pose = torch.stack((rotations, mirror(rotations)))  # everything below is written for the right side
+    sided: dict[str, Tensor] = {}
+    upper = _relative(pose, "right_upper_arm", "chest")
+    sided["shoulder"] = shoulder_excess(-upper[..., 0], twist_x(upper))
+    fore = _relative(pose, "right_forearm", "right_upper_arm")
+    # forearm along -x: in front (-y) when bent; it must stay in the hinge's plane, whatever its pronation
+    bend = torch.atan2(fore[..., 1, 0], fore[..., 0, 0])
+    sided["elbow"] = beyond(bend, -12, 155) + beyond(torch.asin(fore[..., 2, 0].clamp(-1, 1)), -20, 20)
+    thigh = _relative(pose, "right_thigh", "pelvis")
+    down = -thigh[..., 2]
+    flex = torch.atan2(-down[..., 1], -down[..., 2])
+    flex = torch.where(flex < -2.5, flex + 2 * math.pi, flex)
+    aside = torch.asin(-down[..., 0].clamp(-1, 1))
+    sided["hip"] = beyond(flex, -50, 160) * (down[..., 0].abs() < 0.95) + beyond(aside, -45, 85)
+    knee = _relative(pose, "right_shin", "right_thigh")
+    sided["knee"] = beyond(_bend_about_x(knee), -8, 160) + beyond(torch.asin(knee[..., 0, 2].clamp(-1, 1)), -20, 20)
+    sided["ankle"] = beyond(angle_of(_relative(pose, "right_foot", "right_shin")), 0, 75)
+    sided["wrist"] = beyond(angle_of(_relative(pose, "right_hand", "right_forearm")), 0, 105)
+    sided["clavicle"] = beyond(angle_of(_relative(pose, "right_clavicle", "chest")), 0, 50)
+    for joint, value in sided.items():
+        out[f"right_{joint}"], out[f"left_{joint}"] = value.unbind(0)
     return out
 
 
@@ -238,9 +238,10 @@ def to_quaternion(rotation: Tensor) -> Tensor:
     squares = torch.stack((1 + xx + yy + zz, 1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz), -1)
     wx, wy, wz = m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]
     xy, xz, yz = m[..., 0, 1] + m[..., 1, 0], m[..., 0, 2] + m[..., 2, 0], m[..., 1, 2] + m[..., 2, 1]
-    rows = torch.stack(
-        (squares[..., 0], wx, wy, wz, wx, squares[..., 1], xy, xz, wy, xy, squares[..., 2], yz, wz, xz, yz, squares[..., 3]), -1
-    ).unflatten(-1, (4, 4))  # each row is 4 q_i q; take the best conditioned one  # fmt: skip
+    ww, x2, y2, z2 = squares.unbind(-1)
+    rows = torch.stack((ww, wx, wy, wz, wx, x2, xy, xz, wy, xy, y2, yz, wz, xz, yz, z2), -1).unflatten(
+        -1, (4, 4)
+    )  # each row is 4 q_i q; take the best conditioned one
     best = squares.argmax(-1)[..., None, None].expand(*squares.shape[:-1], 1, 4)
     q = rows.gather(-2, best)[..., 0, :]
     q = q / q.norm(dim=-1, keepdim=True)

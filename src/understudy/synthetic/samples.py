@@ -24,6 +24,7 @@ from understudy.voxels import CELL, CELLS, EMPTY, HALF, LIMIT
 _SIZE = 144  # pixels of the simulated depth image: 2.06 cm at the root, with a rim for the baseline
 _PITCH = CELL / 2  # metres of a pixel at the root
 # By how much the first surface may be nearer than a joint that counts as seen, metres.
+_LEAST_SEEN = 4  # joints that the camera must see of a person
 _DEEP = {"nose": 0.06, "eye": 0.06, "ear": 0.06, "neck": 0.17, "hip": 0.2}
 _INSIDE = torch.tensor([_DEEP.get(n.split("_")[-1], 0.12) for n in JOINTS])
 
@@ -183,7 +184,8 @@ class Samples:
         )
         hard = (front < 0.7) | before
         tag = torch.stack([rig.kind, people["activity"].to(rig.kind.dtype)], -1)
-        return Batch(depth, keypoints, root_z[:, None], view, in_view, occluded, hard, tag)
+        batch = Batch(depth, keypoints, root_z[:, None], view, in_view, occluded, hard, tag)
+        return _detectable(batch)
 
     def _boxes(self, cameras: Cameras, boxes: Boxes, R: Tensor, offset: Tensor, scale: Tensor) -> Tensor:
         """Depth of the furniture at half the resolution, doubled."""
@@ -194,6 +196,15 @@ class Samples:
         z = render.cast(boxes, origin, render.to_world(cameras, R, flat))
         z = z.reshape(b, 1, _SIZE // 2, _SIZE // 2)
         return torch.nn.functional.interpolate(z, scale_factor=2, mode="nearest")[:, 0]
+
+
+def _detectable(batch: Batch) -> Batch:
+    """People of whom a detector sees nearly nothing give their place to the next one who is seen."""
+    seen = (batch.in_view & ~batch.occluded).sum(1) >= _LEAST_SEEN
+    number = torch.arange(len(seen), device=seen.device)
+    after = (number[None] - number[:, None]) % len(seen) + torch.where(seen, 0, 2 * len(seen))[None]
+    chosen = after.argmin(1)
+    return Batch(*(t[chosen] for t in batch))
 
 
 def _about_z(angle: Tensor) -> Tensor:

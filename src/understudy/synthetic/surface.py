@@ -82,7 +82,10 @@ def frames(along: Float[Tensor, "n 3"], side: Float[Tensor, "n 3"]) -> Float[Ten
 
 
 def alignment(
-    origins: Float[Tensor, "n s 3"], palms: Float[Tensor, "n 2 3"], tips: Float[Tensor, "n 2 3"], toes: Float[Tensor, "n 2 3"]
+    origins: Float[Tensor, "n s 3"],
+    palms: Float[Tensor, "n 2 3"],
+    tips: Float[Tensor, "n 2 3"],
+    toes: Float[Tensor, "n 2 3"],
 ) -> Float[Tensor, "n s 3 3"]:
     """Rotations from rest to the canonical posture.
 
@@ -160,7 +163,10 @@ def regions(
     ear = joints[[JOINT["right_ear"], JOINT["left_ear"]]].mean(0)
     region[head & scalp(points, eye, ear)] = REGION["scalp"]
     for side, _ in SIDES:
-        at = {p: origins[SEGMENT[f"{side}_{p}"]] for p in ("upper_arm", "forearm", "hand", "fingers", "thigh", "shin", "foot")}
+        at = {
+            p: origins[SEGMENT[f"{side}_{p}"]]
+            for p in ("upper_arm", "forearm", "hand", "fingers", "thigh", "shin", "foot")
+        }
         for part, child in (("upper_arm", "forearm"), ("forearm", "hand"), ("thigh", "shin"), ("shin", "foot")):
             fill(part, of(f"{side}_{part}"), between(at[part], at[child]))
         hand = of(f"{side}_hand", f"{side}_fingers")
@@ -169,3 +175,26 @@ def regions(
         foot = of(f"{side}_foot")
         fill("foot", foot, spread(-points[:, 1], foot))
     return region, along
+
+
+def drape(
+    points: Float[Tensor, "n p 3"], normals: Float[Tensor, "n p 3"], region: Int[Tensor, " p"]
+) -> Float[Tensor, "n p"]:
+    """Distance along the normal from the trunk's surface to its horizontal convex hull, at most 6 cm; elsewhere 0.
+
+    Cloth hangs over hollows (between the breasts, along the spine) and does not follow them.
+    """
+    trunk = ((region == REGION["trunk_upper"]) | (region == REGION["trunk_lower"])).nonzero()[:, 0]
+    p, flat = points[:, trunk], torch.nn.functional.normalize(normals[:, trunk, :2], dim=2)
+    angles = torch.arange(32) * (2 * torch.pi / 32)
+    directions = torch.stack([angles.cos(), angles.sin()])
+    height = p[..., 2].mean(0)
+    slices = ((height - height.min()) / 0.035).long()
+    count = int(slices.max()) + 1
+    ahead = p[..., :2] @ directions  # (N, T, 32)
+    hull = torch.stack([ahead[:, (slices - k).abs() <= 1].amax(1) for k in range(count)], 1)  # slices overlap
+    room = (hull[:, slices] - ahead) / (flat @ directions).clamp_min(1e-3)
+    upright = (1.4 - 2 * normals[:, trunk, 2].abs()).clamp(0, 1)  # not on the shoulders and below the crotch
+    out = torch.zeros(points.shape[:2])
+    out[:, trunk] = room.amin(2).clamp(0, 0.06) * upright
+    return out

@@ -29,7 +29,7 @@ _SIGMA = 0.06  # metres: width of a keypoint's score map
 class NetConfig:
     """Sizes of the default network."""
 
-    channels: tuple[int, int, int] = (48, 80, 128)
+    channels: tuple[int, int, int] = (32, 80, 128)
     """features at 16^3, 8^3 and 4^3"""
     channels_2d: int = 96
     """features of the 2D trunk at 16^2"""
@@ -108,7 +108,7 @@ class VoxelPoseNet(nn.Module):
     def scores(self, depth: Tensor, keypoints: Tensor, root_z: Tensor) -> tuple[Float[Tensor, "b 18 8 4096"], Output]:
         """Also the logits over the 32^3 cells: 8 sub-cells (z, y, x) of each of the 16^3 (z, y, x)."""
         flat = self.trunk_2d(self.maps(self._flat_input(depth, keypoints)))
-        b, c16 = len(depth), self.config.channels[0]
+        b, c16 = depth.shape[0], self.config.channels[0]
         added, lifted = self.lift(flat).split([c16, COARSE * self.config.lifted], 1)
         x = self.first(self._volume(depth, root_z, lifted.reshape(b, -1, COARSE, COARSE, COARSE)))
         x16 = self.block16(F.relu(self.first_norm(x + added[:, :, None])))
@@ -129,7 +129,7 @@ class VoxelPoseNet(nn.Module):
 
     def _volume(self, depth: Tensor, root_z: Tensor, lifted: Tensor) -> Tensor:
         """3D features at 16^3, axes (z, y, x)."""
-        b = len(depth)
+        b = depth.shape[0]
         near = depth[:, :1]
         offset = ((depth[:, :, None] - self.fine[:, None, None]) / CELL).to(lifted.dtype)
         surface = F.relu(1 - offset.abs().amin(1))
@@ -153,7 +153,7 @@ class VoxelPoseNet(nn.Module):
 
     def _read(self, logits: Tensor, features: Tensor, keypoints: Tensor) -> Output:
         """Means, spreads, and the judge's word from features where each joint is believed to be."""
-        b = len(logits)
+        b = logits.shape[0]
         p = logits.reshape(b, N_JOINTS, -1).softmax(-1)
         mean = p @ self.centers
         spread = (p @ self.centers**2 - mean**2).clamp_min(1e-6).sqrt()

@@ -226,7 +226,8 @@ def _read_checkpoint(prefix: Path) -> dict[str, np.ndarray]:
     except ImportError as e:
         convert = (
             f"import numpy, tensorflow; r = tensorflow.train.load_checkpoint('{prefix.name}'); "
-            f"numpy.savez('weights.npz', **{{n: r.get_tensor(n) for n in r.get_variable_to_shape_map() if n.startswith('{SCOPE}/')}})"
+            f"names = [n for n in r.get_variable_to_shape_map() if n.startswith('{SCOPE}/')]; "
+            "numpy.savez('weights.npz', **{n: r.get_tensor(n) for n in names})"
         )
         raise ModelFileError(
             f"{prefix}: reading a TensorFlow checkpoint needs TensorFlow, which is not installed. Either `pip install "

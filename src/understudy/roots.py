@@ -1,0 +1,133 @@
+"""Where a person is: the root of the voxel grid, from whatever 2D and depth evidence there is. Nobody is dropped.
+
+The paper takes the depth at the neck, else at a hip. That puts the root on whatever stands in front of that one joint.
+Here all torso joints and places between them vote, and so does the apparent size: a person of whom all bones come out
+far too short has had the depth of something nearer to the camera.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from jaxtyping import Float
+
+from understudy.camera import Camera
+from understudy.lifting import nearest_depths
+from understudy.skeleton import JOINT, JOINTS, N_JOINTS, TORSO, rows
+from understudy.types import Keypoints2D, RegisteredDepth
+
+_BONES_M: Final = {
+    ("right_shoulder", "left_shoulder"): 0.34,
+    ("neck", "right_hip"): 0.51,
+    ("neck", "left_hip"): 0.51,
+    ("right_shoulder", "right_elbow"): 0.30,
+    ("left_shoulder", "left_elbow"): 0.30,
+    ("right_elbow", "right_wrist"): 0.25,
+    ("left_elbow", "left_wrist"): 0.25,
+    ("right_hip", "right_knee"): 0.42,
+    ("left_hip", "left_knee"): 0.42,
+    ("right_knee", "right_ankle"): 0.40,
+    ("left_knee", "left_ankle"): 0.40,
+}
+_ENDS = np.array([[JOINT[a], JOINT[b]] for a, b in _BONES_M])
+_LENGTHS = np.array(list(_BONES_M.values()))
+# Places on the trunk: shares of (neck, right shoulder, left shoulder, right hip, left hip).
+_PLACES = np.array(
+    [
+        [1, 0, 0, 0, 0], [0, 1, 0, 0, 0], [0, 0, 1, 0, 0], [0, 0, 0, 1, 0], [0, 0, 0, 0, 1],
+        [0, 0.3, 0.3, 0.2, 0.2], [0, 0.5, 0.2, 0.2, 0.1], [0, 0.2, 0.5, 0.1, 0.2], [0, 0.1, 0.1, 0.4, 0.4],
+    ]
+)  # fmt: skip
+_AGREE = 0.22  # metres: depths of one torso lie within
+_SIZES = (0.72, 1.3)  # depth over the depth that the apparent size asks for: what bodies of all sizes allow
+_NECK_TO_CENTER = 0.25  # metres from the neck down to the middle of the trunk
+_HIPS = rows("right_hip", "left_hip")
+
+
+@dataclass(frozen=True)
+class Root:
+    """The middle of a person's trunk surface."""
+
+    point: Float[np.ndarray, "3"]
+    """metres, colour camera's frame"""
+    evidence: str
+    """`torso` (depths of the trunk agree with the size), `body` (depths of other joints), `size` (2D size alone)"""
+
+
+def find_root(person: Keypoints2D, depth: RegisteredDepth, camera: Camera, min_score: float = 0.2) -> Root | None:
+    """None only for a person without any usable 2D keypoint.
+
+    min_score: keypoints with a lower score are not used, unless there are no others.
+    """
+    usable = person.found & (person.score >= min_score)
+    if usable.sum() < 2:
+        usable = person.found
+    if not usable.any():
+        return None
+    uv = np.where(usable[:, None], person.uv, np.nan)
+    ray = camera.normalized(uv)
+    sized = _depth_of_size(ray)
+    torso = np.append(np.median(nearest_depths(depth, camera, _on_trunk(uv)), axis=1), person.torso_z or np.nan)
+    z = _agreed(torso, np.append(np.ones(len(_PLACES)), 3.0), sized)
+    evidence = "torso"
+    if z is None:
+        z, evidence = _agreed(np.median(nearest_depths(depth, camera, uv), axis=1), np.ones(N_JOINTS), sized), "body"
+    if z is None:
+        z, evidence = sized, "size"
+    if z is None:  # one or two keypoints, and nothing to measure them by: any depth is better than none
+        values = nearest_depths(depth, camera, uv, k=1, radius=0.1)
+        if not np.isfinite(values).any():
+            return None
+        z, evidence = float(np.nanmedian(values)), "body"
+    center = _center(ray, z)
+    return Root(np.append(center * z, z), evidence)
+
+
+def _on_trunk(uv: Float[np.ndarray, "18 2"]) -> Float[np.ndarray, "9 2"]:
+    """Image points on the trunk; NaN where the joints that make them are missing."""
+    corners = uv[TORSO]
+    return np.where(_PLACES[..., None] > 0, _PLACES[..., None] * corners, 0.0).sum(1)
+
+
+def _depth_of_size(ray: Float[np.ndarray, "18 2"]) -> float | None:
+    """The depth at which the person's longest-looking bones have an adult's lengths; None with too few joints.
+
+    A bone that points along the view looks short, never long; so the largest ratios count, not the mean.
+    """
+    length = np.linalg.norm(ray[_ENDS[:, 0]] - ray[_ENDS[:, 1]], axis=1)
+    ratio = np.sort(length[np.isfinite(length)] / _LENGTHS[np.isfinite(length)])[::-1]
+    if not len(ratio) or ratio[0] <= 0:
+        return None
+    return float(1 / ratio[: max(1, len(ratio) // 3)].mean())
+
+
+def _agreed(values: np.ndarray, weights: np.ndarray, sized: float | None) -> float | None:
+    """The depth on which most agree, among those that the apparent size allows; None when there is none."""
+    valid = np.isfinite(values)
+    if sized is not None and valid.any():
+        valid &= (values > _SIZES[0] * sized) & (values < _SIZES[1] * sized)
+    if not valid.any():
+        return None
+    values, weights = values[valid], weights[valid]
+    near = np.abs(values[:, None] - values) < _AGREE
+    best = near[np.argmax(near @ weights)]
+    return float(np.median(values[best]))
+
+
+def _center(ray: Float[np.ndarray, "18 2"], z: float) -> Float[np.ndarray, "2"]:
+    """Ray (z = 1) through the middle of the trunk, from neck and hips, or from what there is of them."""
+    neck, hips = ray[JOINT["neck"]], ray[_HIPS]
+    hips = hips[np.isfinite(hips).all(1)]
+    down = np.array([0.0, _NECK_TO_CENTER / z])
+    if np.isfinite(neck).all():
+        return (neck + hips.mean(0)) / 2 if len(hips) else neck + down
+    if len(hips):
+        return hips.mean(0) - down
+    torso = ray[TORSO]
+    torso = torso[np.isfinite(torso).all(1)]
+    return torso.mean(0) + 0.7 * down if len(torso) else np.nanmean(ray, axis=0)
+
+
+assert all(name in JOINTS for pair in _BONES_M for name in pair)
