@@ -4,7 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from understudy.camera import Camera
-from understudy.lifting import RADIUS, NaiveLifter, nearest_depths
+from understudy.lifting import BALL_68, RADIUS, NaiveLifter, nearest_depths
 from understudy.registration import register
 from understudy.skeleton import JOINT, N_JOINTS
 from understudy.types import MISSING, OBSERVED, Frame, Keypoints2D, RegisteredDepth, RegisteredFrame
@@ -120,8 +120,8 @@ def test_a_joint_on_something_else_is_inferred(flat_frame: Frame):
     knee, other = JOINT["right_knee"], JOINT["left_knee"]
     assert person.keypoints[knee, 2] == pytest.approx(2.1)
     assert (person.source[knee], person.source[other]) == ("inferred", OBSERVED)
-    assert person.sigma_m[knee] > 0.8 and person.confidence[knee] < 0.02
-    assert person.sigma_m[other] < 0.1 and person.confidence[other] > 0.6
+    assert person.sigma_m[knee] > 0.8 * BALL_68 and person.confidence[knee] < 0.02
+    assert person.sigma_m[other] < 0.1 * BALL_68 and person.confidence[other] > 0.6
 
 
 def test_shoulders_that_are_too_narrow_are_not_trusted(flat_frame: Frame):
@@ -134,7 +134,7 @@ def test_shoulders_that_are_too_narrow_are_not_trusted(flat_frame: Frame):
         person = NaiveLifter().lift(registered, [seen])[0]
         rows_ = [JOINT["right_shoulder"], JOINT["left_shoulder"]]
         confidence.append(person.confidence[rows_].max())
-        sigma.append(person.sigma_m[rows_].min())
+        sigma.append(person.sigma_m[rows_].min() / BALL_68)
     assert confidence[0] < 0.5 < confidence[1]
     assert sigma[0] > 0.1 > sigma[1]
 
@@ -147,6 +147,6 @@ def test_keypoints_of_low_score_are_inferred(flat_frame: Frame):
     weak = NaiveLifter().lift(registered, [Keypoints2D.from_rows(rows_)])[0]
     wrist = JOINT["left_wrist"]
     assert (sure.source[wrist], weak.source[wrist]) == (OBSERVED, "inferred")
-    assert weak.sigma_m[wrist] > 0.14 > sure.sigma_m[wrist]
+    assert weak.sigma_m[wrist] / BALL_68 > 0.14 > sure.sigma_m[wrist] / BALL_68
     assert weak.confidence[wrist] < 0.3 * sure.confidence[wrist]
     np.testing.assert_array_equal(weak.keypoints, sure.keypoints)  # positions are the paper's

@@ -3,6 +3,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -270,10 +271,11 @@ def test_calibration_of_a_calibrated_predictor():
     sigma = rng.uniform(0.01, 0.1, size=confidence.size)
     c = Calibration.of(errors, confidence, sigma)
     assert c.ece < 0.01 and c.bin_count.sum() == c.n == confidence.size
-    gaussian = np.linalg.norm(rng.normal(size=(confidence.size, 3)) * sigma[:, None], axis=-1)
+    one_axis = sigma / np.sqrt(chi2.ppf(0.68, 3))  # sigma is the radius that holds 68 %
+    gaussian = np.linalg.norm(rng.normal(size=(confidence.size, 3)) * one_axis[:, None], axis=-1)
     c = Calibration.of(gaussian, confidence, sigma)
-    assert c.within_1_sigma == pytest.approx(0.1987, abs=0.005)
-    assert c.within_2_sigma == pytest.approx(0.7385, abs=0.005)
+    assert c.within_1_sigma == pytest.approx(0.68, abs=0.005)
+    assert c.within_2_sigma == pytest.approx(0.9971, abs=0.002)
 
 
 def test_calibration_of_a_boaster():

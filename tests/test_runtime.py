@@ -97,6 +97,27 @@ def test_many_threads_get_the_same_bits(ir, streams):
         assert all((alone[i] == y).all() for i, y in together)
 
 
+def test_first_calls_at_the_same_time_do_not_block_each_other(tmp_path):
+    """OpenVINO's own first calls do, once in 30 processes: in none of these may it happen."""
+    (tmp_path / "net.onnx").write_bytes(onnx_file())
+    code = f"""if True:
+        import sys, threading
+        import numpy as np
+        from pathlib import Path
+        from understudy.runtime import load
+        sys.setswitchinterval(1e-6)
+        network, start = load(Path({str(tmp_path / "net.onnx")!r}), threads=2, streams=2), threading.Barrier(8)
+        def work():
+            start.wait()
+            network(np.zeros(3, np.float32))
+        threads = [threading.Thread(target=work) for _ in range(8)]
+        for t in threads: t.start()
+        for t in threads: t.join()
+    """
+    for _ in range(3):
+        subprocess.run([sys.executable, "-c", code], check=True, timeout=50)
+
+
 def test_a_call_that_failed_leaves_no_trace(network):
     expected = network(volume(6), ONE)[0]
     with pytest.raises(RuntimeError):

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from understudy import detectors
+from pathlib import Path
+
+from understudy import detectors, methods
 from understudy.detectors.base import Detector
-from understudy.errors import UnderstudyError, one_of
-from understudy.lifting import LIFTERS
+from understudy.errors import UnderstudyError
+from understudy.methods import METHODS
 from understudy.registration import register
 from understudy.types import Frame, Keypoints2D, Person, RegisteredFrame
 
-METHODS = tuple(LIFTERS)
-"""Methods of lifting, by name."""
+__all__ = ["METHODS", "Estimator"]
 
 
 class Estimator:
@@ -18,25 +19,29 @@ class Estimator:
 
     1. `register`: depth into the colour camera's frame and pixels.
     2. `detect`: 2D keypoints of everybody in the colour image.
-    3. `lift`: keypoints + depth -> 3D joints, by the chosen method. `naive` is one step; the voxel
-       network takes this place with its own: root, voxels, network, assembly.
+    3. `lift`: keypoints + depth -> 3D joints, by the chosen method. `voxelposenet` has stages of its own
+       (`voxel_lifting`: root, view, network, assembly); `naive` is the baseline.
 
     Stateless: frames may come in any order. Identities over time are the business of `tracking`.
     """
 
-    def __init__(self, method: str = "naive", detector: Detector | str = "blazepose", min_score: float = 0.2):
+    def __init__(
+        self,
+        method: str = methods.DEFAULT,
+        detector: Detector | str = "blazepose",
+        min_score: float = 0.2,
+        weights: Path | None = None,
+    ):
         """method: one of METHODS. detector: an object, or a name that `detectors.create` knows.
 
-        min_score: 2D keypoints with a lower score are not lifted, in [0, 1].
+        min_score: 2D keypoints with a lower score are not used, in [0, 1]. weights: an exported network of one's own.
         """
-        if method not in LIFTERS:
-            raise UnderstudyError(f"method {method!r}: must be {one_of(METHODS)}")
         if not 0 <= min_score <= 1:
             raise UnderstudyError(f"min_score {min_score}: must be in [0, 1]")
         self.method = method
         self.min_score = min_score
         self.detector = detectors.create(detector) if isinstance(detector, str) else detector
-        self._lifter = LIFTERS[method](min_score)
+        self._lifter = methods.create(method, min_score, weights)
 
     def estimate(self, frame: Frame | RegisteredFrame) -> list[Person]:
         """People of one frame, as many as the detector finds; who cannot be lifted is listed with `failed`."""

@@ -1,10 +1,9 @@
-"""From 2D keypoints and depth to people in 3D. A method is a `Lifter`; `LIFTERS` names them."""
+"""From 2D keypoints and depth to people in 3D. A method is a `Lifter`; `methods` names them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from types import MappingProxyType
-from typing import Final, Protocol, runtime_checkable
+from collections.abc import Sequence
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Float32
@@ -18,6 +17,9 @@ NEAREST = 3
 """valid depths whose median is taken (the paper's naive lifting)"""
 RADIUS = 0.02
 """search radius around a keypoint, in image widths: about 19 pixels of a 960-pixel image"""
+
+BALL_68 = 1.8724
+"""radius that holds 68 % of an isotropic 3D Gaussian, in its standard deviations along one axis"""
 
 SEEN_SCORE = 0.5
 """a 2D keypoint with a lower score is likely hidden (the paper's threshold for its score maps)"""
@@ -83,13 +85,9 @@ class NaiveLifter:
             keypoints_2d=seen,
             keypoints=np.where(lifted[:, None], keypoints, np.nan),
             confidence=seen.score * within,
-            sigma_m=np.where(lifted, sigma, np.nan),
+            sigma_m=np.where(lifted, BALL_68 * sigma, np.nan),
             source=tuple(np.where(lifted, np.where((beyond > 0) | (weak > 0), INFERRED, OBSERVED), MISSING).tolist()),
         )
-
-
-LIFTERS: Final = MappingProxyType[str, Callable[[float], Lifter]]({"naive": NaiveLifter})
-"""Name of a method -> its lifter, made from the least 2D score."""
 
 
 def _sigma(z: np.ndarray, spread: np.ndarray, camera: Camera) -> np.ndarray:

@@ -25,7 +25,7 @@ from typing import Any
 import cv2
 
 import understudy
-from understudy import detectors
+from understudy import detectors, methods
 from understudy.errors import DetectorError, FrameError, RecordingError
 from understudy.estimator import Estimator
 from understudy.files import parse_json, read_json, write_atomically
@@ -59,6 +59,8 @@ class Settings:
     detector_input: str
     """which files a detector reads its keypoints from; empty for others"""
     min_score: float
+    weights: str = ""
+    """SHA-256 of a network of one's own; empty for the one that comes with the package"""
     version: str = understudy.__version__
     format: str = CONFIG_FORMAT
 
@@ -67,9 +69,10 @@ def estimate_recording(
     recording: Recording,
     out: Path,
     *,
-    method: str = "naive",
+    method: str = methods.DEFAULT,
     detector: str = "blazepose",
     min_score: float = 0.2,
+    weights: Path | None = None,
     overlays: bool = True,
     restart: bool = False,
     progress: bool = False,
@@ -83,11 +86,12 @@ def estimate_recording(
     Raises RecordingError when `out` holds results of other settings, or something that is not ours.
     """
     out = Path(out)
-    estimator = Estimator(method, detectors.create(detector, recording), min_score)
+    estimator = Estimator(method, detectors.create(detector, recording), min_score, weights)
     source = (out / PAIR).resolve() if isinstance(recording, PairRecording) else recording.path.resolve()
     reads = _detector_input(recording, detector)
     cameras = recording.camera.to_json()
-    settings = Settings(str(source), cameras, recording.unit_m, method, detector, reads, min_score)
+    own = hashlib.sha256(weights.read_bytes()).hexdigest() if weights else ""
+    settings = Settings(str(source), cameras, recording.unit_m, method, detector, reads, min_score, own)
     _prepare(out, settings, restart)
     name = recording.name
     if isinstance(recording, PairRecording):

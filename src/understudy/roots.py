@@ -41,19 +41,24 @@ _PLACES = np.array(
     ]
 )  # fmt: skip
 _AGREE = 0.22  # metres: depths of one torso lie within
-_SIZES = (0.72, 1.3)  # depth over the depth that the apparent size asks for: what bodies of all sizes allow
+_LIMBS = np.array([i for i in range(N_JOINTS) if i not in TORSO])
+_WEIGHTS = np.concatenate([np.ones(len(_PLACES)), [3.0], np.full(len(_LIMBS), 0.15)])  # of trunk, component, limbs
+_SIZE_SIGMA = 0.35  # of the log of depth over the depth that the apparent size asks for
+_LEAST_CREDIBLE = 0.08
+_LEAST_CREDIBLE_LIMBS = 0.75  # without any depth on the trunk: limbs are thin, and what is behind them is near
+_INSIDE = 0.08  # metres from the trunk's surface to its middle
 _NECK_TO_CENTER = 0.25  # metres from the neck down to the middle of the trunk
 _HIPS = rows("right_hip", "left_hip")
 
 
 @dataclass(frozen=True)
 class Root:
-    """The middle of a person's trunk surface."""
+    """The middle of a person's trunk."""
 
     point: Float[np.ndarray, "3"]
     """metres, colour camera's frame"""
     evidence: str
-    """`torso` (depths of the trunk agree with the size), `body` (depths of other joints), `size` (2D size alone)"""
+    """`depth`, or `size`: no depth was near the person that its apparent size allows"""
 
 
 def find_root(person: Keypoints2D, depth: RegisteredDepth, camera: Camera, min_score: float = 0.2) -> Root | None:
@@ -69,20 +74,20 @@ def find_root(person: Keypoints2D, depth: RegisteredDepth, camera: Camera, min_s
     uv = np.where(usable[:, None], person.uv, np.nan)
     ray = camera.normalized(uv)
     sized = _depth_of_size(ray)
-    torso = np.append(np.median(nearest_depths(depth, camera, _on_trunk(uv)), axis=1), person.torso_z or np.nan)
-    z = _agreed(torso, np.append(np.ones(len(_PLACES)), 3.0), sized)
-    evidence = "torso"
-    if z is None:
-        z, evidence = _agreed(np.median(nearest_depths(depth, camera, uv), axis=1), np.ones(N_JOINTS), sized), "body"
+    trunk = np.median(nearest_depths(depth, camera, _on_trunk(uv)), axis=1)
+    limbs = np.median(nearest_depths(depth, camera, uv[_LIMBS]), axis=1)
+    votes = np.concatenate([trunk, [person.torso_z or np.nan], limbs])
+    z, evidence = _elected(votes, sized), "depth"
     if z is None:
         z, evidence = sized, "size"
     if z is None:  # one or two keypoints, and nothing to measure them by: any depth is better than none
         values = nearest_depths(depth, camera, uv, k=1, radius=0.1)
         if not np.isfinite(values).any():
             return None
-        z, evidence = float(np.nanmedian(values)), "body"
+        z, evidence = float(np.nanmedian(values)), "depth"
     center = _center(ray, z)
-    return Root(np.append(center * z, z), evidence)
+    point = np.append(center * z, z)
+    return Root(point * (1 + _INSIDE / np.linalg.norm(point)), evidence)
 
 
 def _on_trunk(uv: Float[np.ndarray, "18 2"]) -> Float[np.ndarray, "9 2"]:
@@ -94,26 +99,31 @@ def _on_trunk(uv: Float[np.ndarray, "18 2"]) -> Float[np.ndarray, "9 2"]:
 def _depth_of_size(ray: Float[np.ndarray, "18 2"]) -> float | None:
     """The depth at which the person's longest-looking bones have an adult's lengths; None with too few joints.
 
-    A bone that points along the view looks short, never long; so the largest ratios count, not the mean.
+    A bone that points along the view looks short, never long; so large ratios count, not the mean.
     """
     length = np.linalg.norm(ray[_ENDS[:, 0]] - ray[_ENDS[:, 1]], axis=1)
     ratio = np.sort(length[np.isfinite(length)] / _LENGTHS[np.isfinite(length)])[::-1]
     if not len(ratio) or ratio[0] <= 0:
         return None
-    return float(1 / ratio[: max(1, len(ratio) // 3)].mean())
+    some = ratio[1:5] if len(ratio) > 4 else ratio[:2]  # the longest of many is often a misplaced keypoint
+    return float(1 / some.mean())
 
 
-def _agreed(values: np.ndarray, weights: np.ndarray, sized: float | None) -> float | None:
-    """The depth on which most agree, among those that the apparent size allows; None when there is none."""
+def _elected(values: np.ndarray, sized: float | None) -> float | None:
+    """The depth on which most of `values` agree; None when nothing that the apparent size allows was measured.
+
+    Each value votes for those near it. What makes the person a dwarf or a giant counts less, the more so the further
+    it goes, so that a few depths of an occluder do not outvote the rest; but many that agree win over a wrong size.
+    """
     valid = np.isfinite(values)
-    if sized is not None and valid.any():
-        valid &= (values > _SIZES[0] * sized) & (values < _SIZES[1] * sized)
     if not valid.any():
         return None
-    values, weights = values[valid], weights[valid]
+    values, weights = values[valid], _WEIGHTS[valid]
+    credible = np.ones(len(values)) if sized is None else np.exp(-0.5 * (np.log(values / sized) / _SIZE_SIGMA) ** 2)
     near = np.abs(values[:, None] - values) < _AGREE
-    best = near[np.argmax(near @ weights)]
-    return float(np.median(values[best]))
+    best = np.argmax((near @ weights) * credible)
+    least = _LEAST_CREDIBLE if valid[: len(_PLACES) + 1].any() else _LEAST_CREDIBLE_LIMBS
+    return float(np.median(values[near[best]])) if credible[best] > least else None
 
 
 def _center(ray: Float[np.ndarray, "18 2"], z: float) -> Float[np.ndarray, "2"]:

@@ -12,11 +12,17 @@ import sys
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
+from threading import Lock
 from typing import Any, Final
 
 import numpy as np
 
 from understudy.errors import ModelFileError, one_of
+
+_ONE_THREAD = Lock()
+"""Held while in OpenVINO's Python layer: two threads that use a part of it for the first time can block each other for
+good (2026.4: one holds the interpreter's lock and waits for the other to set up a static table, which needs that lock).
+Not held while a network computes."""
 
 KINDS: Final = (".tflite", ".onnx", ".xml")
 """File name endings: TensorFlow Lite, ONNX, OpenVINO IR (its weights beside it, in .bin)."""
@@ -31,7 +37,7 @@ class Network:
 
     def __init__(self, compiled: Any, outputs: Sequence[str] = ()):
         self._compiled = compiled
-        self._idle: list[Any] = []  # requests that nobody uses; pop and append are atomic
+        self._idle: list[Any] = []  # requests that nobody uses
         self.inputs: Final[tuple[str, ...]] = _names(compiled.inputs)
         self.outputs: Final[tuple[str, ...]] = tuple(outputs) or _names(compiled.outputs)
 
@@ -43,13 +49,14 @@ class Network:
         given = {**dict(zip(self.inputs, inputs, strict=False)), **named}
         if set(given) != set(self.inputs) or len(inputs) + len(named) != len(self.inputs):
             raise TypeError(f"the network takes each of {self.inputs} once, not {len(inputs)} arrays and {list(named)}")
-        try:
-            request = self._idle.pop()
-        except IndexError:
-            request = self._compiled.create_infer_request()
-        results = request.infer([given[name] for name in self.inputs])
-        self._idle.append(request)  # unless it failed
-        return tuple(results[i] for i in range(len(self.outputs)))
+        with _ONE_THREAD:
+            request = self._idle.pop() if self._idle else self._compiled.create_infer_request()
+            request.start_async([given[name] for name in self.inputs])
+        request.wait()
+        with _ONE_THREAD:
+            results = tuple(request.get_output_tensor(i).data.copy() for i in range(len(self.outputs)))
+            self._idle.append(request)  # unless it failed
+        return results
 
 
 def load(path: Path, *, threads: int | None = None, streams: int = 1, outputs: Sequence[str] = ()) -> Network:
@@ -64,7 +71,6 @@ def load(path: Path, *, threads: int | None = None, streams: int = 1, outputs: S
         raise ModelFileError(f"{path}: a network's file name must end in {one_of(KINDS)}")
     if not path.is_file():
         raise ModelFileError(f"{path}: there is no such file")
-    openvino, core = _openvino()
     config: dict[str, object] = {
         "INFERENCE_PRECISION_HINT": "f32",
         "PERFORMANCE_HINT": "LATENCY",
@@ -74,16 +80,22 @@ def load(path: Path, *, threads: int | None = None, streams: int = 1, outputs: S
     if threads is not None:
         config["INFERENCE_NUM_THREADS"] = threads
     try:
-        model = core.read_model(path)
-        if outputs:
-            results = {name: result for result in model.get_results() for name in result.output(0).names}
-            if absent := [name for name in outputs if name not in results]:
-                raise ModelFileError(f"{path}: the network has no output {absent[0]!r}; it has {one_of(results)}")
-            model = openvino.Model([results[name] for name in outputs], model.get_parameters())
-        return Network(core.compile_model(model, "CPU", config), outputs)
+        with _ONE_THREAD:
+            return Network(_compiled(path, outputs, config), outputs)
     except RuntimeError as e:
         lines = [line for line in str(e).splitlines() if line and not line.startswith(("Exception from", "Check"))]
         raise ModelFileError(f"{path}: damaged, or not a network that OpenVINO can read: {' '.join(lines)}") from e
+
+
+def _compiled(path: Path, outputs: Sequence[str], config: dict[str, object]) -> Any:
+    openvino, core = _openvino()
+    model = core.read_model(path)
+    if outputs:
+        results = {name: result for result in model.get_results() for name in result.output(0).names}
+        if absent := [name for name in outputs if name not in results]:
+            raise ModelFileError(f"{path}: the network has no output {absent[0]!r}; it has {one_of(results)}")
+        model = openvino.Model([results[name] for name in outputs], model.get_parameters())
+    return core.compile_model(model, "CPU", config)
 
 
 @cache

@@ -155,7 +155,7 @@ class Person:
     confidence: Float[np.ndarray, "18"]
     """probability that the joint is within 10 cm of the truth; 0 where missing"""
     sigma_m: Float[np.ndarray, "18"]
-    """one standard deviation of the position, isotropic, metres; NaN where missing"""
+    """one sigma of the position, metres: the ball of this radius holds the truth with 68 %; NaN where missing"""
     source: tuple[str, ...]
     """per joint: observed, inferred or missing"""
     id: int = 0

@@ -73,8 +73,8 @@ PALM_COLUMNS: Final = (
 )
 CALIBRATION_COLUMNS: Final = (
     Column("ECE", "%", "ece_percent", 1),
-    Column("within 1 sigma", "%, right: 19.9", "within_1_sigma_percent", 1),
-    Column("within 2 sigma", "%, right: 73.9", "within_2_sigma_percent", 1),
+    Column("within 1 sigma", "%, right: 68", "within_1_sigma_percent", 1),
+    Column("within 2 sigma", "%, Gaussian: 99.7", "within_2_sigma_percent", 1),
     Column("flexion", "deg", "flexion_deg", 1),
     Column("ID switches", "", "id_switches", 0),
 )

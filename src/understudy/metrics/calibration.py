@@ -13,8 +13,8 @@ from understudy.metrics.joints import share
 CONFIDENT_WITHIN_M: Final = 0.10
 """metres: `confidence` is the probability of an error of at most this"""
 N_BINS: Final = 10
-EXPECTED_WITHIN_SIGMA: Final = (0.1987, 0.7385)
-"""shares of errors within 1 and 2 sigma of an isotropic 3D Gaussian (chi distribution, 3 degrees of freedom)"""
+EXPECTED_WITHIN_SIGMA: Final = (0.68, 0.9971)
+"""shares of errors within 1 and 2 sigma: what sigma means, and what an isotropic 3D Gaussian then has within 2"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,9 +34,9 @@ class Calibration:
     n_sigma: int
     """joints with a sigma"""
     within_1_sigma: float
-    """share of errors of at most sigma; 0.199 when sigma is right"""
+    """share of errors of at most sigma; 0.68 when sigma is right"""
     within_2_sigma: float
-    """share of errors of at most 2 sigma; 0.739 when sigma is right"""
+    """share of errors of at most 2 sigma; 0.997 for Gaussian errors, less where errors have tails"""
 
     @classmethod
     def of(

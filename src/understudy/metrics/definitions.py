@@ -169,12 +169,12 @@ _BODY: Final = (
     ),
     MetricDefinition(
         "within_1_sigma_percent", "within 1 sigma", "%",
-        "Share of the errors of at most sigma_m. An isotropic 3D Gaussian has 19.9 %: more means sigma is too large.",
+        "Share of the errors of at most sigma_m. By definition 68 %: more means sigma is too large.",
         lambda e: 100 * e.calibration.within_1_sigma,
     ),
     MetricDefinition(
         "within_2_sigma_percent", "within 2 sigma", "%",
-        "Share of the errors of at most 2 sigma_m. An isotropic 3D Gaussian has 73.9 %.",
+        "Share of the errors of at most 2 sigma_m. An isotropic 3D Gaussian has 99.7 %; tails have less.",
         lambda e: 100 * e.calibration.within_2_sigma,
     ),
 )  # fmt: skip

@@ -23,7 +23,8 @@ class Draw:
 
     def heavy(self, *shape: int) -> Tensor:
         """Of unit variance for most, with tails: Student's t with 4 degrees of freedom, scaled."""
-        chi = sum(self.normal(*shape) ** 2 for _ in range(4)) / 4
+        a, b, c, d = (self.normal(*shape) ** 2 for _ in range(4))
+        chi = (a + b + c + d) / 4
         return self.normal(*shape) / (chi.sqrt() + 0.05) / 2**0.5
 
     def lognormal(self, sigma: float, *shape: int) -> Tensor:

@@ -2,43 +2,50 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from typing import Final
+
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from understudy.synthetic.scene import Boxes, Cameras
 
-_FAR = 60.0  # metres: nothing there
+FAR: Final = 60.0
+"""metres: nothing there"""
 _TICKS = 4096.0  # per metre: depths are compared as integers, which carry the label of the point in their last bit
+_NEAREST = 0.15  # metres: points nearer to the camera are left out
+_NEAREST_BOX = 0.05  # metres, the same for boxes
 
 
 def splat(
-    points: Float[Tensor, "b n 3"], label: Bool[Tensor, "b n"], scale: Float[Tensor, "b"], size: int
+    points: Float[Tensor, "b n 3"], label: Bool[Tensor, "b n"], scale: Float[Tensor, " b"], size: int
 ) -> tuple[Float[Tensor, "b s s"], Bool[Tensor, "b s s"]]:
     """Nearest point of each pixel, every point covering 2 x 2 pixels; NaN points are left out.
 
     points: camera's frame, metres. scale: focal length in pixels; the optical axis meets the image's centre.
-    Returns depths (metres; _FAR where there is nothing), and the labels of what is seen.
+    Returns depths (metres; FAR where there is nothing), and the labels of what is seen.
     """
     b = len(points)
     z = points[..., 2]
-    ok = z > 0.15  # False for NaN
-    uv = points[..., :2] / z.clamp_min(0.15)[..., None] * scale[:, None, None] + size / 2 - 1.0
+    ok = z > _NEAREST  # False for NaN
+    uv = points[..., :2] / z.clamp_min(_NEAREST)[..., None] * scale[:, None, None] + size / 2 - 1.0
     corner = uv.nan_to_num(-9.0).clamp(-9, size + 9).floor().int()
-    key = (z.nan_to_num(_FAR) * _TICKS).int() * 2 + label.int()
-    buffer = torch.full((b, size * size), int(_FAR * _TICKS) * 2, dtype=torch.int32, device=points.device)
+    key = (z.nan_to_num(FAR) * _TICKS).int() * 2 + label.int()
+    nothing = int(FAR * _TICKS) * 2
+    buffer = torch.full((b, size * size), nothing, dtype=torch.int32, device=points.device)
     for dy in (0, 1):
         for dx in (0, 1):
             u, v = corner[..., 0] + dx, corner[..., 1] + dy
             inside = ok & (u >= 0) & (u < size) & (v >= 0) & (v < size)
             index = torch.where(inside, v * size + u, 0)
-            value = torch.where(inside, key, int(_FAR * _TICKS) * 2)
+            value = torch.where(inside, key, nothing)
             buffer.scatter_reduce_(1, index.long(), value, "amin")
     depth = torch.div(buffer, 2, rounding_mode="floor").float() / _TICKS
     return depth.reshape(b, size, size), (buffer % 2 == 1).reshape(b, size, size)
 
 
-def pixel_rays(scale: Float[Tensor, "b"], size: int) -> Float[Tensor, "b s s 3"]:
+def pixel_rays(scale: Float[Tensor, " b"], size: int) -> Float[Tensor, "b s s 3"]:
     """Directions (z = 1) of the pixels' centres."""
     offset = torch.arange(size, device=scale.device, dtype=torch.float32) + 0.5 - size / 2
     v, u = torch.meshgrid(offset, offset, indexing="ij")
@@ -47,16 +54,50 @@ def pixel_rays(scale: Float[Tensor, "b"], size: int) -> Float[Tensor, "b s s 3"]
 
 
 def cast(boxes: Boxes, origin: Float[Tensor, "b 3"], rays: Float[Tensor, "b n 3"]) -> Float[Tensor, "b n"]:
-    """Distance along each ray (world frame, in lengths of the ray) to the nearest box; _FAR where there is none."""
-    start = boxes.local(origin[:, None])
-    direction = boxes.local(rays, vectors=True)
-    inverse = 1 / torch.where(direction.abs() < 1e-6, 1e-6, direction)
-    a = (-boxes.half[:, :, None] - start) * inverse
-    c = (boxes.half[:, :, None] - start) * inverse
-    enter = torch.minimum(a, c).amax(-1)
-    leave = torch.maximum(a, c).amin(-1)
-    hit = (enter < leave) & (enter > 0.05)
-    return torch.where(hit, enter, _FAR).amin(1)
+    """Distance along each ray (world frame, in lengths of the ray) to the nearest box; FAR where there is none.
+
+    A box that holds the origin is not hit.
+    """
+    nearest = torch.full(rays.shape[:2], FAR, device=rays.device)
+    for distance in _each_box(boxes, origin, rays):
+        torch.minimum(nearest, distance, out=nearest)
+    return nearest
+
+
+def cast_which(
+    boxes: Boxes, origin: Float[Tensor, "b 3"], rays: Float[Tensor, "b n 3"]
+) -> tuple[Float[Tensor, "b n"], Int[Tensor, "b n"]]:
+    """As `cast`, and the number of the box that is hit; -1 for none."""
+    nearest = torch.full(rays.shape[:2], FAR, device=rays.device)
+    which = torch.full(rays.shape[:2], -1, device=rays.device)
+    for k, distance in enumerate(_each_box(boxes, origin, rays)):
+        which[distance < nearest] = k
+        torch.minimum(nearest, distance, out=nearest)
+    return nearest, which
+
+
+def _each_box(boxes: Boxes, origin: Tensor, rays: Tensor) -> Iterator[Float[Tensor, "b n"]]:
+    """Distances to one box after the other; box by box, temporaries stay in the cache."""
+    x, y, z = rays.unbind(-1)
+    start = boxes.local(origin[:, None])[:, :, 0]
+    inverse_z = 1 / torch.where(z.abs() < 1e-6, 1e-6, z)
+    cos, sin = boxes.yaw.cos()[..., None], boxes.yaw.sin()[..., None]
+    for k in range(boxes.half.shape[1]):
+        c, s = cos[:, k], sin[:, k]
+        enter = leave = None
+        for axis in range(3):
+            if axis == 2:
+                inverse = inverse_z
+            else:
+                direction = c * x + s * y if axis == 0 else c * y - s * x
+                inverse = 1 / torch.where(direction.abs() < 1e-6, 1e-6, direction)
+            a = (-boxes.half[:, k, axis, None] - start[:, k, axis, None]) * inverse
+            b = (boxes.half[:, k, axis, None] - start[:, k, axis, None]) * inverse
+            first, last = torch.minimum(a, b), torch.maximum(a, b)
+            enter = first if enter is None else torch.maximum(enter, first, out=first)
+            leave = last if leave is None else torch.minimum(leave, last, out=last)
+        assert enter is not None and leave is not None
+        yield torch.where((enter < leave) & (enter > _NEAREST_BOX), enter, FAR)
 
 
 def to_world(cameras: Cameras, R_view_cam: Float[Tensor, "b 3 3"], rays: Float[Tensor, "b n 3"]) -> Tensor:

@@ -41,7 +41,14 @@ _PARENT = {
 PARENTS: Final = tuple(SEGMENT[_PARENT[name]] if name in _PARENT else -1 for name in SEGMENTS)
 """Index of each segment's parent; -1 for the pelvis, whose origin is the midpoint of the hips."""
 
-_JOINT_SEGMENT = {"shoulder": "upper_arm", "elbow": "forearm", "wrist": "hand", "hip": "thigh", "knee": "shin", "ankle": "foot"}
+_JOINT_SEGMENT = {
+    "shoulder": "upper_arm",
+    "elbow": "forearm",
+    "wrist": "hand",
+    "hip": "thigh",
+    "knee": "shin",
+    "ankle": "foot",
+}
 
 
 def _carrier(joint: str) -> str:

@@ -1,5 +1,7 @@
-"""What depth cameras do to exact depth: noise, flying pixels, holes, limits of the image (`../shared` of the field:
-Nguyen 2012 for Kinect v1, Fankhauser 2015 for v2, Tölgyessy 2021 for Azure Kinect, Intel's tuning guide for the D400).
+"""What depth cameras do to exact depth: noise, flying pixels, holes, limits of the image.
+
+Sources: Nguyen 2012 for Kinect v1, Fankhauser 2015 for v2, Tölgyessy 2021 for Azure Kinect, Intel's tuning guide for
+the D400.
 """
 
 from __future__ import annotations
@@ -23,6 +25,7 @@ class Sensor:
     color_tan: tuple[float, float]
     """tangent of half the colour image's angle, across and down"""
     depth_tan: tuple[float, float]
+    """the same of the depth image"""
     depth_pitch: float
     """radians by which the depth camera looks down against the colour camera"""
     pixel: float
@@ -40,21 +43,79 @@ class Sensor:
     dark_hole: float
     """share of dark surfaces without depth"""
     max_z: float
+    """metres: nothing farther is measured"""
 
 
 SENSORS: Final = MappingProxyType(
     {
-        "kinect2": Sensor((0.89, 0.50), (0.70, 0.58), 0.0, 1 / 365, (0.045, 0.06), (0.0015, -0.0005, 0.0003), 0, 0.35, 0.35, 0.6, 8.0),
-        "azure": Sensor((1.02, 0.58), (0.63, 0.57), 0.105, 1 / 504, (0.025, 0.04), (0.0005, 0.0010, 0.0), 0, 0.15, 0.7, 0.6, 5.5),
-        "realsense": Sensor((0.69, 0.39), (1.0, 0.60), 0.0, 1 / 425, (0.01, 0.055), (0.001, 0.0, 0.0038), 3.0, 0.3, 0.5, 0.1, 8.0),
-        "other": Sensor((0.62, 0.48), (0.66, 0.5), 0.0, 1 / 300, (0.0, 0.08), (0.002, 0.0, 0.002), 1.5, 0.3, 0.3, 0.3, 6.0),
+        "kinect2": Sensor(
+            color_tan=(0.89, 0.50),
+            depth_tan=(0.70, 0.58),
+            depth_pitch=0.0,
+            pixel=1 / 365,
+            baseline=(0.045, 0.06),
+            sigma=(0.0015, -0.0005, 0.0003),
+            smooth=0,
+            flying=0.35,
+            edge_hole=0.35,
+            dark_hole=0.6,
+            max_z=8.0,
+        ),
+        "azure": Sensor(
+            color_tan=(1.02, 0.58),
+            depth_tan=(0.63, 0.57),
+            depth_pitch=0.105,
+            pixel=1 / 504,
+            baseline=(0.025, 0.04),
+            sigma=(0.0005, 0.0010, 0.0),
+            smooth=0,
+            flying=0.15,
+            edge_hole=0.7,
+            dark_hole=0.6,
+            max_z=5.5,
+        ),
+        "realsense": Sensor(
+            color_tan=(0.69, 0.39),
+            depth_tan=(1.0, 0.60),
+            depth_pitch=0.0,
+            pixel=1 / 425,
+            baseline=(0.01, 0.055),
+            sigma=(0.001, 0.0, 0.0038),
+            smooth=3.0,
+            flying=0.3,
+            edge_hole=0.5,
+            dark_hole=0.1,
+            max_z=8.0,
+        ),
+        "other": Sensor(
+            color_tan=(0.62, 0.48),
+            depth_tan=(0.66, 0.5),
+            depth_pitch=0.0,
+            pixel=1 / 300,
+            baseline=(0.0, 0.08),
+            sigma=(0.002, 0.0, 0.002),
+            smooth=1.5,
+            flying=0.3,
+            edge_hole=0.3,
+            dark_hole=0.3,
+            max_z=6.0,
+        ),
     }
 )
 """Name -> sensor. `other` stands for depth cameras that are not among the first three."""
 
+_EDGE = 0.08  # metres: a step between neighbouring pixels that counts as an edge
+_FARTHEST = 9.0  # metres: flying pixels are not drawn farther back than this
+_NEAREST = 0.25  # metres: nothing nearer is measured
+_LEAST_SIGMA = 0.0005  # metres
+
 
 class Rig:
-    """The sensors of a batch, one per scene, with what varies from unit to unit."""
+    """The sensors of a batch, one per scene, with what varies from unit to unit. Every attribute: (B, ...).
+
+    Attributes are those of `Sensor`, besides `kind` (number in `names`), `baseline` (B, 3: the depth camera's place in
+    the colour camera's frame) and `keep` (share of pixels that are measured at all).
+    """
 
     def __init__(self, draw: Draw, names: tuple[str, ...], b: int):
         table = [SENSORS[n] for n in names]
@@ -71,8 +132,10 @@ class Rig:
         self.pixel = column([s.pixel for s in table]) * draw.lognormal(0.2, b)
         low, high = column([s.baseline[0] for s in table]), column([s.baseline[1] for s in table])
         side = torch.where(draw.chance(0.5, b), 1.0, -1.0)
-        self.baseline = torch.stack([side * draw.uniform(low, high, b), 0.006 * draw.normal(b), 0.004 * draw.normal(b)], -1)
-        self.sigma = torch.stack([column([s.sigma[i] for s in table]) for i in range(3)], -1) * draw.lognormal(0.4, b)[:, None]
+        across = side * draw.uniform(low, high, b)
+        self.baseline = torch.stack([across, 0.006 * draw.normal(b), 0.004 * draw.normal(b)], -1)
+        sigma = torch.stack([column([s.sigma[i] for s in table]) for i in range(3)], -1)
+        self.sigma = sigma * draw.lognormal(0.4, b)[:, None]
         self.smooth = column([s.smooth for s in table])
         self.flying = column([s.flying for s in table]) * draw.lognormal(0.4, b)
         self.edge_hole = column([s.edge_hole for s in table])
@@ -80,42 +143,62 @@ class Rig:
         self.max_z = column([s.max_z for s in table]) * draw.uniform(0.8, 1.1, b)
         self.keep = 1 - draw.uniform(0, 0.6, b) * draw.chance(0.3, b)
 
-    def degrade(self, draw: Draw, z: Float[Tensor, "b s s"], dark: Bool[Tensor, "b s s"]) -> Float[Tensor, "b s s"]:
-        """Exact depth -> what the sensor says; 0 = no measurement. dark: surfaces that return little light."""
-        b, s, _ = z.shape
-        shape = (b, s, s)
+    def degrade(
+        self, draw: Draw, z: Float[Tensor, "b h w"], dark: Bool[Tensor, "b h w"], finer: int = 1
+    ) -> Float[Tensor, "b h w"]:
+        """Exact depth -> what the sensor says, metres; 0 = no measurement.
 
-        def per(x: Tensor) -> Tensor:
-            return x[:, None, None]
+        dark: surfaces that return little light. finer: how many times smaller the pixels are than those of the
+        simulated network input (2 cm at the person); holes come in patches of about 4 of those.
+        """
+        b, h, w = z.shape
+        shape = (b, h, w)
+
+        def field(pixels: int) -> Tensor:
+            """Smooth and random, about standard normal."""
+            cells = draw.normal(b, 1, max(h // pixels, 1), max(w // pixels, 1))
+            return F.interpolate(cells, size=(h, w), mode="bilinear")[:, 0]
 
         far = F.max_pool2d(z, 3, 1, 1)
         near = -F.max_pool2d(-z, 3, 1, 1)
-        edge = (far - near) > 0.08
+        edge = (far - near) > _EDGE
         dice = draw.uniform(0, 1, *shape)
-        mixed = near + (far.clamp_max(9.0) - near).clamp_min(0) * draw.uniform(0, 1, *shape) ** 2
-        share = per(self.flying) * 0.3
+        mixed = near + (far.clamp_max(_FARTHEST) - near).clamp_min(0) * draw.uniform(0, 1, *shape) ** 2
+        share = _per_scene(self.flying) * 0.3
         out = torch.where(edge & (dice < share), mixed, z)
-        hole = edge & (dice > 1 - per(self.edge_hole) * 0.5)
-        # patches: smooth random fields, cut at a level
-        patch = F.interpolate(draw.normal(b, 1, s // 4, s // 4), size=(s, s), mode="bilinear")[:, 0]
-        hole |= dark & (patch > 2.0 * (0.5 - per(self.dark_hole)))
+        hole = edge & (dice > 1 - _per_scene(self.edge_hole) * 0.5)
+        patch = field(4 * finer)
+        hole |= dark & (patch > 2.0 * (0.5 - _per_scene(self.dark_hole)))
         spots = draw.uniform(0, 1, b) ** 4
-        hole |= patch > 3.2 - 2.0 * per(spots)
-        hole |= draw.uniform(0, 1, *shape) > per(self.keep)
+        hole |= patch > 3.2 - 2.0 * _per_scene(spots)
+        hole |= draw.uniform(0, 1, *shape) > _per_scene(self.keep)
         white = draw.normal(*shape)
-        soft = F.interpolate(draw.normal(b, 1, s // 3, s // 3), size=(s, s), mode="bilinear")[:, 0] * 1.3
-        noise = torch.where(per(self.smooth) > 0, soft, white)
-        c0, c1, c2 = (per(self.sigma[:, i]) for i in range(3))
-        slope = (1 + ((far - near) / (0.04 * z)).clamp(0, 1.5))
-        out = out + noise * (c0 + c1 * z + c2 * z * z).clamp_min(0.0005) * slope
-        hole |= (out > per(self.max_z)) | (out < 0.25)
+        soft = field(3) * 1.3
+        noise = torch.where(_per_scene(self.smooth) > 0, soft, white)
+        slope = 1 + ((far - near) / (0.04 * z)).clamp(0, 1.5)
+        out = out + noise * self.sigma_at(z) * slope
+        hole |= (out > _per_scene(self.max_z)) | (out < _NEAREST)
         return torch.where(hole, 0.0, out)
 
-    def seen_by(self, tangent: Tensor, direction: Float[Tensor, "b n 3"], pitch: Tensor | None = None) -> Bool[Tensor, "b n"]:
-        """Which directions (colour camera's frame) lie inside an image of that half angle."""
+    def sigma_at(self, z: Float[Tensor, "b h w"]) -> Float[Tensor, "b h w"]:
+        """Axial noise (one sigma, metres) of a surface that faces the camera at these depths."""
+        c0, c1, c2 = (_per_scene(self.sigma[:, i]) for i in range(3))
+        return (c0 + c1 * z + c2 * z * z).clamp_min(_LEAST_SIGMA)
+
+    def seen_by(
+        self, tangent: Float[Tensor, "b 2"], direction: Float[Tensor, "b n 3"], pitch: Tensor | None = None
+    ) -> Bool[Tensor, "b n"]:
+        """Which directions (colour camera's frame) lie inside an image of that half angle.
+
+        pitch: (B,) radians by which that camera looks down.
+        """
         x, y, z = direction.unbind(-1)
         if pitch is not None:
             c, s = pitch.cos()[:, None], pitch.sin()[:, None]
             y, z = c * y - s * z, s * y + c * z
         ok = z > 0.05
         return ok & (x.abs() < tangent[:, :1] * z) & (y.abs() < tangent[:, 1:] * z)
+
+
+def _per_scene(x: Tensor) -> Tensor:
+    return x[:, None, None]

@@ -6,6 +6,7 @@ import io
 import warnings
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from understudy.files import write_atomically
@@ -13,10 +14,16 @@ from understudy.voxelposenet.net import VoxelPoseNet
 from understudy.voxels import CELLS
 
 INPUTS, OUTPUTS = ("depth", "keypoints", "root_z"), ("joints", "spread", "head")
+_LARGE = 256  # numbers: what is stored in half precision
 
 
-def export_onnx(net: VoxelPoseNet, path: Path) -> None:
-    """Writes the network as ONNX, for any number of people at once."""
+def export_onnx(net: VoxelPoseNet, path: Path, half: bool = True) -> None:
+    """Writes the network as ONNX, for any number of people at once.
+
+    half: store the weights as float16 (half the size); runtimes compute in float32 all the same.
+    """
+    import onnx
+
     example = (torch.rand(2, 2, CELLS, CELLS), torch.rand(2, 18, 3), torch.full((2, 1), 3.0))
     buffer = io.BytesIO()
     with warnings.catch_warnings():
@@ -25,4 +32,24 @@ def export_onnx(net: VoxelPoseNet, path: Path) -> None:
             net.eval(), example, buffer, input_names=list(INPUTS), output_names=list(OUTPUTS),
             dynamic_axes={name: {0: "people"} for name in (*INPUTS, *OUTPUTS)}, dynamo=False, opset_version=17,
         )  # fmt: skip
-    write_atomically(path, buffer.getvalue())
+    model = onnx.load_from_string(buffer.getvalue())
+    if half:
+        _halve(model.graph)
+    onnx.checker.check_model(model)
+    write_atomically(path, model.SerializeToString())
+
+
+def _halve(graph: object) -> None:
+    """Every large float32 constant becomes float16, followed by a cast back, which runtimes carry out when loading."""
+    from onnx import TensorProto, helper, numpy_helper
+
+    casts = []
+    for tensor in graph.initializer:  # type: ignore[attr-defined]
+        if tensor.data_type != TensorProto.FLOAT or np.prod(tensor.dims) < _LARGE:
+            continue
+        name = tensor.name
+        stored = numpy_helper.from_array(numpy_helper.to_array(tensor).astype(np.float16), f"{name}.half")
+        tensor.CopyFrom(stored)
+        casts.append(helper.make_node("Cast", [f"{name}.half"], [name], to=TensorProto.FLOAT))
+    for node in reversed(casts):
+        graph.node.insert(0, node)  # type: ignore[attr-defined]

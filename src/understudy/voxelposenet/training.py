@@ -1,83 +1,49 @@
-"""Training of the default network: one configuration in, weights and the record of how they came about out.
+"""Training: one configuration in, weights and the record of how they came about out.
 
-    OUT/config.json            the effective configuration, versions, command
-    OUT/log.csv                one line every `log_every` steps
-    OUT/validation.csv         one line per validation: errors over all, visible, occluded joints, calibration
-    OUT/checkpoint.safetensors weights, moving average, optimiser; a run that is started again goes on from here
-    OUT/weights.safetensors    the moving average: what is shipped
+OUT/config.json              the effective configuration, versions, command
+OUT/log.csv                  one line every `log_every` steps
+OUT/validation.csv           one line per validation: errors over all, visible, occluded joints, calibration
+OUT/validation_joints.csv    the same validations per joint; also _distance and _sensor
+OUT/*.png                    curves, see `curves`
+OUT/checkpoint.safetensors   weights, moving average, optimiser; a run that is started again goes on from here
+OUT/weights.safetensors      the moving average: what is shipped
 """
 
 from __future__ import annotations
 
-import csv
 import json
 import math
 import os
 import platform
+import signal
 import sys
+import threading
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, field, replace
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.utils.data import DataLoader, Sampler
 
-from understudy.errors import UnderstudyError
-from understudy.files import write_atomically
+from understudy.errors import MissingExtraError, UnderstudyError
+from understudy.files import read_json, write_atomically
 from understudy.synthetic.samples import Batch
-from understudy.voxelposenet.checkpoint import load_checkpoint, save_checkpoint, save_weights
-from understudy.voxelposenet.data import Batches, DataConfig
-from understudy.voxelposenet.loss import loss
-from understudy.voxelposenet.net import NetConfig, VoxelPoseNet
-from understudy.voxelposenet.validation import validate
+from understudy.synthetic.sensors import SENSORS
+from understudy.voxelposenet import curves, kinds, records, validation
+from understudy.voxelposenet.checkpoint import load_checkpoint, save_checkpoint
+from understudy.voxelposenet.data import Batches
+from understudy.voxelposenet.train_config import PRESETS, TrainConfig, differences, from_json
 
-CONFIG, LOG, VALIDATION, CHECKPOINT, WEIGHTS = (
-    "config.json", "log.csv", "validation.csv", "checkpoint.safetensors", "weights.safetensors",
-)  # fmt: skip
+__all__ = ["PRESETS", "TrainConfig", "Trainer", "read_config"]
 
-
-@dataclass(frozen=True)
-class TrainConfig:
-    """Everything that decides the weights."""
-
-    net: NetConfig = field(default_factory=NetConfig)
-    data: DataConfig = field(default_factory=DataConfig)
-    steps: int = 8000
-    batch: int = 16
-    """people per step and process"""
-    learning_rate: float = 2e-3
-    warmup: int = 300
-    """steps of linear increase; a cosine follows, down to a hundredth"""
-    weight_decay: float = 0.02
-    ema: float = 0.998
-    """of the moving average of the weights; 0 = none"""
-    clip: float = 5.0
-    """largest norm of the gradient"""
-    bf16: bool = True
-    """bfloat16 autocast"""
-    seed: int = 0
-    validation_samples: int = 512
-    validation_seed: int = 1_000_003
-    validate_every: int = 1000
-    checkpoint_every: int = 250
-    log_every: int = 25
-    workers: int = 1
-    """processes that simulate"""
-    device: str = "cpu"
-
-
-PRESETS: dict[str, TrainConfig] = {
-    "default": TrainConfig(),
-    "smoke": TrainConfig(
-        net=NetConfig(channels=(8, 8, 8), channels_2d=8, lifted=2),
-        data=DataConfig(bodies="capsules", capsules=4),
-        steps=6, batch=4, warmup=2, validation_samples=8, validate_every=3, checkpoint_every=2, log_every=1, workers=0,
-    ),
-}  # fmt: skip
-"""Name -> configuration. `smoke` proves that everything runs."""
+CONFIG, CHECKPOINT, WEIGHTS = "config.json", "checkpoint.safetensors", "weights.safetensors"
+_VALIDATION_BATCH = 16
+_VALIDATION_BODIES = {"anny": 60, "capsules": 40}
 
 
 class _Numbers(Sampler[int]):
@@ -93,29 +59,68 @@ class _Numbers(Sampler[int]):
         return len(self.numbers)
 
 
-@dataclass
+@dataclass(frozen=True)
 class _World:
     """The processes that train together (torchrun); one when started without it."""
 
+    device: torch.device
     rank: int = 0
     size: int = 1
 
     @classmethod
     def join(cls, device: str) -> _World:
-        if "WORLD_SIZE" not in os.environ or int(os.environ["WORLD_SIZE"]) < 2:
-            return cls()
-        torch.distributed.init_process_group("nccl" if device.startswith("cuda") else "gloo")
-        return cls(torch.distributed.get_rank(), torch.distributed.get_world_size())
+        here = torch.device(device)
+        if here.type == "cuda" and not torch.cuda.is_available():
+            raise UnderstudyError(f"device {device!r}: this machine, or this build of torch, has no CUDA device")
+        if int(os.environ.get("WORLD_SIZE", "1")) < 2:
+            return cls(here)
+        if here.type == "cuda":
+            here = torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0")))
+            torch.cuda.set_device(here)
+        if not torch.distributed.is_initialized():
+            torch.distributed.init_process_group("nccl" if here.type == "cuda" else "gloo")
+        return cls(here, torch.distributed.get_rank(), torch.distributed.get_world_size())
+
+    def any(self, here: bool) -> bool:
+        """Whether it is so in any of the processes; all must ask."""
+        if self.size == 1:
+            return here
+        flag = torch.tensor(int(here), device=self.device)
+        torch.distributed.all_reduce(flag, torch.distributed.ReduceOp.MAX)
+        return bool(flag)
+
+
+class _Stop:
+    """Ctrl-C and SIGTERM wait until a step is done; a second one does not."""
+
+    def __init__(self) -> None:
+        self.asked = False
+        self._before: dict[int, Any] = {}
+
+    def __enter__(self) -> _Stop:
+        if threading.current_thread() is threading.main_thread():
+            self._before = {s: signal.signal(s, self._ask) for s in (signal.SIGINT, signal.SIGTERM)}
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    def _ask(self, number: int, frame: FrameType | None) -> None:
+        if self.asked:
+            raise KeyboardInterrupt
+        self.asked = True
 
 
 class Trainer:
-    """One training run. `run` returns when the last step is done, or on an interruption, which loses nothing."""
+    """One training run. `run` returns when the last step is done; an interruption loses nothing."""
 
     def __init__(self, config: TrainConfig, out: Path):
         self.config, self.out = config, Path(out)
         self.world = _World.join(config.device)
         torch.manual_seed(config.seed)
-        self.net = _channels_last(VoxelPoseNet(config.net).to(config.device))
+        self.kind = kinds.make(config, self.world.device)
+        self.net = self.kind.net
         decay = [p for p in self.net.parameters() if p.ndim > 1]
         rest = [p for p in self.net.parameters() if p.ndim <= 1]
         groups = [{"params": decay, "weight_decay": config.weight_decay}, {"params": rest, "weight_decay": 0.0}]
@@ -126,133 +131,178 @@ class Trainer:
 
     def _prepare(self) -> None:
         """Makes the folder, or goes on with the run that it holds if that has the same configuration."""
-        now = json.loads(json.dumps(asdict(self.config)))
         path = self.out / CONFIG
         if path.exists():
-            before = json.loads(path.read_text())["config"]
-            free = ("steps", "workers", "device", "checkpoint_every", "log_every", "validate_every")
-            different = [k for k in now if k not in free and before.get(k) != now[k]]
-            if different:
+            for name, (before, now) in differences(read_config(path), self.config).items():
                 raise UnderstudyError(
-                    f"{path}: the run there has another {different[0]} ({before.get(different[0])!r}, now "
-                    f"{now[different[0]]!r}); choose another folder, or delete that one"
+                    f"{path}: the run there has another {name} ({before!r}, now {now!r}); choose another folder, or "
+                    "delete that one"
                 )
         if (self.out / CHECKPOINT).exists():
             self.step, self.seconds = load_checkpoint(self.out / CHECKPOINT, self.net, self.average, self.optimizer)
+        if self.world.size > 1:
+            torch.distributed.barrier()  # all have read what the first one now writes
         if self.world.rank == 0:
-            about = {"config": now, "command": sys.argv, "torch": torch.__version__, "machine": platform.processor() or platform.machine(), "processes": self.world.size}
+            for name in (records.LOG, records.VALIDATION, *records.TABLES.values()):
+                records.keep_until(self.out / name, self.step)
+            machine = platform.processor() or platform.machine()
+            about = {"config": asdict(self.config), "command": sys.argv, "torch": torch.__version__}
+            about |= {"machine": machine, "processes": self.world.size}
             write_atomically(path, json.dumps(about, indent=1) + "\n")
 
-    def run(self, report: Callable[[dict[str, Any]], object] = lambda row: None) -> VoxelPoseNet:
-        """Trains to the end; `report` gets each line of the log. Returns the network with the averaged weights."""
+    def run(
+        self,
+        report: Callable[[dict[str, Any]], object] = lambda row: None,
+        progress: Callable[[int], object] = lambda step: None,
+    ) -> nn.Module:
+        """Trains to the end. Returns the network with the averaged weights.
+
+        report: gets each line of the log (it has `loss`) and of the validations (`all`). progress: gets the number of
+        steps done after each. Raises KeyboardInterrupt after it has saved when Ctrl-C or SIGTERM asks to stop.
+        """
         config = self.config
-        model: nn.Module = _Scores(self.net)
+        model: nn.Module = _Learning(self.kind)
         if self.world.size > 1:
             model = nn.parallel.DistributedDataParallel(model)
         batches = Batches(config.data, config.batch, config.seed, 2**62)
         numbers = _Numbers(self.step, config.steps, self.world.rank, self.world.size)
-        loader = DataLoader(batches, batch_size=None, sampler=numbers, num_workers=config.workers,
-                            prefetch_factor=4 if config.workers else None, worker_init_fn=_one_thread)  # fmt: skip
-        start, seconds, sums, since = time.monotonic(), self.seconds, {}, 0
-        try:
+        start, seconds, sums, since = time.monotonic(), self.seconds, dict[str, Tensor](), 0
+        with _Stop() as stop:
+            self._validate(report, stop)  # when an interruption came between a step and its validation
+            loader = DataLoader(batches, batch_size=None, sampler=numbers, num_workers=config.workers,
+                                prefetch_factor=4 if config.workers else None, worker_init_fn=_worker)  # fmt: skip
             for batch in loader:
-                parts = self._learn(model, Batch(*(t.to(config.device) for t in batch)))
+                parts = self._learn(model, Batch(*(t.to(self.world.device) for t in batch)))
                 self.step += 1
                 since += 1
                 self.seconds = seconds + time.monotonic() - start
-                sums = {k: sums.get(k, 0.0) + v for k, v in parts.items()}
+                sums = {k: sums[k] + v if k in sums else v for k, v in parts.items()}
+                progress(self.step)
                 if self.step % config.log_every == 0 or self.step == config.steps:
-                    row = {"step": self.step, "hours": round(self.seconds / 3600, 4), "learning_rate": self._rate(),
-                           **{k: round(float(v) / since, 5) for k, v in sums.items()}}  # fmt: skip
-                    self._log(LOG, row)
-                    report(row)
+                    self._log({k: float(v) / since for k, v in sums.items()}, report)
                     sums, since = {}, 0
-                if self.step % config.checkpoint_every == 0:
+                asked = self.world.any(stop.asked)
+                if self.step % config.checkpoint_every == 0 or self.step == config.steps or asked:
                     self._save()
-                if self.step % config.validate_every == 0 or self.step == config.steps:
-                    report(self._validate())
-        finally:
+                if asked:
+                    raise KeyboardInterrupt
+                self._validate(report, stop)
+                self.seconds = seconds + time.monotonic() - start
             self._save()
         return self.averaged()
 
     def _learn(self, model: nn.Module, batch: Batch) -> dict[str, Tensor]:
         self.net.train()
         for group in self.optimizer.param_groups:
-            group["lr"] = self._rate()
-        with torch.autocast(batch.depth.device.type, torch.bfloat16, enabled=self.config.bf16):
-            logits, output = model(batch.depth, batch.keypoints, batch.root_z)
-        total, parts = loss(logits, output, batch.joints, batch.root_z, batch.in_view & ~batch.occluded)
+            group["lr"] = self.config.rate(self.step)
+        total, parts = model(*batch)
         self.optimizer.zero_grad(set_to_none=True)
         total.backward()
-        nn.utils.clip_grad_norm_(self.net.parameters(), self.config.clip)
+        if self.config.clip:
+            nn.utils.clip_grad_norm_(self.net.parameters(), self.config.clip)
         self.optimizer.step()
-        share = min(self.config.ema, (self.step + 1) / (self.step + 10))
+        keep = self.config.average_share(self.step)
         with torch.no_grad():
             for k, v in self.net.state_dict().items():
                 if v.is_floating_point():
-                    self.average[k].lerp_(v, 1 - share)
+                    self.average[k].lerp_(v, 1 - keep)
                 else:
                     self.average[k].copy_(v)
         return {"loss": total.detach(), **{k: v.detach() for k, v in parts.items()}}
 
-    def _rate(self) -> float:
-        c = self.config
-        if self.step < c.warmup:
-            return c.learning_rate * (self.step + 1) / c.warmup
-        done = (self.step - c.warmup) / max(1, c.steps - c.warmup)
-        return c.learning_rate * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * min(1.0, done))))
-
-    def averaged(self) -> VoxelPoseNet:
+    def averaged(self) -> nn.Module:
         """A copy with the averaged weights, for use."""
-        net = VoxelPoseNet(self.config.net).to(self.config.device)
-        net.load_state_dict(self.average)
-        return net.eval()
+        return self.kind.copy(self.average)
 
-    def _validate(self) -> dict[str, Any]:
-        if self.world.rank:
-            return {}
-        c = self.config
-        data = replace(c.data, bodies_seed=c.data.bodies_seed + 1000, anny=60, capsules=40)
-        batches = Batches(data, 16, c.validation_seed, math.ceil(c.validation_samples / 16))
-        row = {"step": self.step, "hours": round(self.seconds / 3600, 4), **validate(self.averaged(), batches)}
-        self._log(VALIDATION, row)
-        return row
+    def close(self) -> None:
+        """Leaves the processes that train together."""
+        if self.world.size > 1:
+            torch.distributed.destroy_process_group()
 
-    def _log(self, name: str, row: dict[str, Any]) -> None:
-        if self.world.rank:
+    def _log(self, means: Mapping[str, float], report: Callable[[dict[str, Any]], object]) -> None:
+        if not math.isfinite(means["loss"]):
+            raise UnderstudyError(
+                f"step {self.step}: the loss is {means['loss']}; the last good state is {self.out / CHECKPOINT}. "
+                "A lower learning_rate or clip may help"
+            )
+        row = {**self._when(), "learning_rate": self.config.rate(self.step - 1)}
+        row |= {k: round(v, 5) for k, v in means.items()}
+        if self.world.rank == 0:
+            records.append(self.out / records.LOG, [row])
+            report(row)
+
+    def _when(self) -> dict[str, Any]:
+        return {"step": self.step, "hours": round(self.seconds / 3600, 4)}
+
+    def _validate(self, report: Callable[[dict[str, Any]], object], stop: _Stop) -> None:
+        """Validates in the first process, if it is time to and has not been done."""
+        due = self.step > 0 and (self.step % self.config.validate_every == 0 or self.step == self.config.steps)
+        if not due or self.world.rank:
             return
-        path = self.out / name
-        new = not path.exists()
-        with path.open("a", newline="", encoding="utf-8") as f:
-            writer = csv.DictWriter(f, list(row))
-            if new:
-                writer.writeheader()
-            writer.writerow(row)
+        if any(int(row["step"]) == self.step for row in records.read(self.out / records.VALIDATION)):
+            return
+        self._save()
+
+        def unless_stopped(batches: Batches) -> Iterator[Batch]:
+            for batch in batches:
+                if stop.asked:
+                    raise KeyboardInterrupt
+                yield Batch(*(t.to(self.world.device) for t in batch))
+
+        results = validation.collect(self.averaged(), unless_stopped(self._validation()), self.kind.estimate)
+        for kind, name in records.TABLES.items():
+            rows = validation.TABLES[kind](results, self.config.data.samples.sensors)
+            records.append(self.out / name, [{**self._when(), **row} for row in rows])
+        row = {**self._when(), **validation.summary(results)}
+        records.append(self.out / records.VALIDATION, [row])
+        report(row)
+        if self.config.plots:
+            try:
+                curves.write(self.out)
+            except MissingExtraError as e:
+                warnings.warn(str(e), stacklevel=2)
+
+    def _validation(self) -> Batches:
+        """Other people and scenes than those of training, with every sensor."""
+        data = self.config.data
+        counts = {k: min(n, getattr(data, k)) for k, n in _VALIDATION_BODIES.items()}
+        samples = replace(data.samples, sensors=tuple(SENSORS))
+        data = replace(data, bodies_seed=data.bodies_seed + 1000, samples=samples, **counts)
+        size = min(_VALIDATION_BATCH, self.config.batch) if self.config.network != "default" else _VALIDATION_BATCH
+        count = math.ceil(self.config.validation_samples / size)
+        return Batches(data, size, self.config.validation_seed, count)
 
     def _save(self) -> None:
         if self.world.rank:
             return
         save_checkpoint(self.out / CHECKPOINT, self.net, self.average, self.optimizer, self.step, self.seconds)
-        save_weights(self.out / WEIGHTS, self.average, self.config.net, {"step": str(self.step)})
+        self.kind.save(self.out / WEIGHTS, self.average, {"step": str(self.step)})
 
 
-class _Scores(nn.Module):
-    """`VoxelPoseNet.scores` as a module's forward, which data-parallel training wraps."""
+class _Learning(nn.Module):
+    """`Kind.learn` as a module's forward, which data-parallel training wraps."""
 
-    def __init__(self, net: VoxelPoseNet):
+    def __init__(self, kind: kinds.Kind):
         super().__init__()
-        self.net = net
+        self.kind = kind
+        self.net = kind.net
 
-    def forward(self, depth: Tensor, keypoints: Tensor, root_z: Tensor) -> Any:
-        return self.net.scores(depth, keypoints, root_z)
-
-
-def _channels_last(net: VoxelPoseNet) -> VoxelPoseNet:
-    for module in net.modules():
-        if isinstance(module, nn.Conv3d | nn.ConvTranspose3d):
-            module.to(memory_format=torch.channels_last_3d)
-    return net
+    def forward(self, *batch: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        return self.kind.learn(Batch(*batch))
 
 
-def _one_thread(worker: int) -> None:
+def read_config(path: Path, base: TrainConfig | None = None) -> TrainConfig:
+    """A configuration from a file: a run's config.json, or a JSON object of some of `TrainConfig`'s fields.
+
+    base: has what the file does not say. Raises UnderstudyError that names the file and the field.
+    """
+    data = read_json(path)
+    inner = data["config"] if isinstance(data.get("config"), dict) else data
+    return from_json(inner, base or TrainConfig(), str(path))
+
+
+def _worker(number: int) -> None:
+    """A simulating process: one thread, and the keyboard is the main process's business."""
     torch.set_num_threads(1)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)

@@ -1,0 +1,129 @@
+"""The networks that can be trained, and what differs between them: making, loss, reading, writing (torch)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import NamedTuple, Protocol
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from understudy.synthetic.samples import Batch
+from understudy.voxelposenet import paper_data
+from understudy.voxelposenet.checkpoint import save_weights
+from understudy.voxelposenet.loss import loss
+from understudy.voxelposenet.net import VoxelPoseNet
+from understudy.voxelposenet.paper_lifter import sigma_of_score
+from understudy.voxelposenet.paper_net import PaperNet, paper_loss
+from understudy.voxelposenet.tensorflow_weights import save_paper_weights
+from understudy.voxelposenet.train_config import TrainConfig
+
+
+class Estimate(NamedTuple):
+    """What a network says of a batch."""
+
+    joints: Float[Tensor, "b 18 3"]
+    """view coordinates, metres"""
+    sigma: Float[Tensor, "b 18"]
+    """metres"""
+    confidence: Float[Tensor, "b 18"]
+
+
+class Kind(Protocol):
+    """One network, as training sees it."""
+
+    net: nn.Module
+
+    def learn(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
+        """The loss, and its parts for the log; `error` among them is the mean error in metres, where it is known."""
+        ...
+
+    def estimate(self, net: nn.Module, batch: Batch) -> Estimate:
+        """What a copy of the network says of people."""
+        ...
+
+    def copy(self, state: Mapping[str, Tensor]) -> nn.Module:
+        """A network for use, with other weights."""
+        ...
+
+    def save(self, path: Path, state: Mapping[str, Tensor], about: Mapping[str, str]) -> None:
+        """Writes weights, with words about them."""
+        ...
+
+
+class DefaultKind:
+    """`VoxelPoseNet` with its loss."""
+
+    def __init__(self, config: TrainConfig, device: torch.device):
+        self.config = config
+        self.net = self._make(device)
+
+    def _make(self, device: torch.device) -> VoxelPoseNet:
+        net = VoxelPoseNet(self.config.net).to(device)
+        for module in net.modules():
+            if isinstance(module, nn.Conv3d | nn.ConvTranspose3d):
+                module.to(memory_format=torch.channels_last_3d)
+        return net
+
+    def learn(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
+        with torch.autocast(batch.depth.device.type, torch.bfloat16, enabled=self.config.bf16):
+            logits, output = self.net.scores(batch.depth, batch.keypoints, batch.root_z)
+        return loss(logits, output, batch.joints, batch.root_z, batch.in_view & ~batch.occluded)
+
+    def estimate(self, net: nn.Module, batch: Batch) -> Estimate:
+        return read_default(net, batch)
+
+    def copy(self, state: Mapping[str, Tensor]) -> nn.Module:
+        net = self._make(next(self.net.parameters()).device)
+        net.load_state_dict(state)
+        return net.eval()
+
+    def save(self, path: Path, state: Mapping[str, Tensor], about: Mapping[str, str]) -> None:
+        save_weights(path, state, self.config.net, about)
+
+
+class PaperKind:
+    """The published network with its loss, on input made by `paper_data`."""
+
+    def __init__(self, config: TrainConfig, device: torch.device):
+        self.config = config
+        self.net = PaperNet(config.network).to(device)
+
+    def learn(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
+        made = paper_data.paper_batch(batch, self.config.grid)
+        with torch.autocast(batch.depth.device.type, torch.bfloat16, enabled=self.config.bf16):
+            volumes = self.net(made.input)
+        total = paper_loss(tuple(v.float() for v in volumes), made.index)
+        metres, _ = paper_data.peaks(volumes[-1].detach().float(), made.origin)
+        away = (metres - paper_data.to_metres(batch.joints, batch.root_z)).norm(dim=-1)
+        return total, {"error": away.mean(), "rooted": made.rooted.float().mean()}
+
+    def estimate(self, net: nn.Module, batch: Batch) -> Estimate:
+        made = paper_data.paper_batch(batch, self.config.grid)
+        metres, score = paper_data.peaks(net(made.input)[-1], made.origin)
+        sigma = sigma_of_score(score.cpu().numpy(), paper_data.cell_size(self.config.grid))
+        joints = paper_data.assembled(metres, score, batch)
+        return Estimate(joints, torch.as_tensor(sigma, dtype=score.dtype, device=score.device), score.clamp(0, 1))
+
+    def copy(self, state: Mapping[str, Tensor]) -> nn.Module:
+        net = PaperNet(self.config.network).to(next(self.net.parameters()).device)
+        net.load_state_dict(state)
+        return net.eval()
+
+    def save(self, path: Path, state: Mapping[str, Tensor], about: Mapping[str, str]) -> None:
+        net = PaperNet(self.config.network)
+        net.load_state_dict(state)
+        save_paper_weights(net.variables(), path, about)
+
+
+def make(config: TrainConfig, device: torch.device) -> Kind:
+    """The network of a configuration, with fresh weights."""
+    return DefaultKind(config, device) if config.network == "default" else PaperKind(config, device)
+
+
+def read_default(net: nn.Module, batch: Batch) -> Estimate:
+    """What the default network says of people."""
+    out = net(batch.depth, batch.keypoints, batch.root_z)
+    return Estimate(out.joints, out.head[..., 0].exp(), out.head[..., 1].sigmoid())
