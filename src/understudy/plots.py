@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from understudy.errors import MissingExtraError
 from understudy.metrics import PCK_THRESHOLDS_M, Evaluation
@@ -80,6 +81,42 @@ def calibration(evaluations: Mapping[str, Evaluation], title: str) -> bytes:
     return _png(figure)
 
 
+def pck_over_distance(
+    shares: Mapping[str, Float[np.ndarray, " k"]],
+    counts: Int[np.ndarray, " k"],
+    edges_m: Sequence[float],
+    title: str,
+) -> bytes:
+    """Share of joints within 10 cm, in bins of the person's distance; NaN: no point. Below: joints in each bin."""
+    figure = _figure(9, 6.4, f"Joints within 10 cm over the person's distance: {title}")
+    curves, bars = figure.subplots(2, 1, sharex=True, height_ratios=[4, 1])
+    edges = np.asarray(edges_m)
+    centers = (edges[:-1] + edges[1:]) / 2
+    for i, (method, share) in enumerate(shares.items()):
+        some = ~np.isnan(share)
+        curves.plot(centers[some], 100 * share[some], marker="o", markersize=4, label=method, **_style(i))
+    curves.set(ylabel="joints within 10 cm, %\n(left out: not within)", ylim=(0, 100))
+    curves.grid(alpha=0.3)
+    curves.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize=9)
+    bars.bar(centers, counts, np.diff(edges) * 0.9, color=_GREY)
+    filled = np.flatnonzero(counts)
+    if len(filled):
+        bars.set_xlim(edges[filled[0]], edges[filled[-1] + 1])
+    bars.set(xlabel="distance of the person from the camera, m", ylabel="joints")
+    return _png(figure)
+
+
+def grouped_bars(heights: Mapping[str, Sequence[float]], groups: Sequence[str], label: str, title: str) -> bytes:
+    """Groups side by side, one bar per method in each, with its number."""
+    figure = _figure(12, 5.4, title)
+    axes = figure.subplots()
+    _bars(axes, {k: list(v) for k, v in heights.items()}, label_bars=True, digits=1)
+    axes.set_xticks(range(len(groups)), [g.replace(", ", ",\n") for g in groups], fontsize=10)
+    axes.set_ylabel(label)
+    axes.legend(loc="lower left", bbox_to_anchor=(0, 1.0), ncols=4, fontsize=9, frameon=False)
+    return _png(figure)
+
+
 def _reliability(axes: Axes, evaluations: Mapping[str, Evaluation]) -> None:
     axes.plot([0, 100], [0, 100], color=_GREY, linewidth=0.8, linestyle=":")
     for i, (method, evaluation) in enumerate(evaluations.items()):
@@ -108,7 +145,7 @@ def _sigma(axes: Axes, evaluations: Mapping[str, Evaluation]) -> None:
     }
     _bars(axes, within, label_bars=True)
     for x, expected in enumerate(EXPECTED_WITHIN_SIGMA):
-        label = "right for a 3D Gaussian" if x == 0 else ""
+        label = "what sigma claims (2 sigma: a Gaussian's)" if x == 0 else ""
         axes.hlines(100 * expected, x - 0.44, x + 0.44, color="black", linewidth=1.2, linestyle="--", label=label)
         axes.annotate(f" {100 * expected:.1f}", (x + 0.44, 100 * expected), va="center", fontsize=9)
     axes.set_xlim(-0.5, 1.62)
@@ -117,14 +154,14 @@ def _sigma(axes: Axes, evaluations: Mapping[str, Evaluation]) -> None:
     axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.11), fontsize=9, ncols=2)
 
 
-def _bars(axes: Axes, heights: Mapping[str, list[float]], label_bars: bool = False) -> None:
+def _bars(axes: Axes, heights: Mapping[str, list[float]], label_bars: bool = False, digits: int = 0) -> None:
     """Groups side by side, one bar per method in each."""
     width = 0.8 / max(len(heights), 1)
     for i, (method, values) in enumerate(heights.items()):
         x = np.arange(len(values)) + (i - (len(heights) - 1) / 2) * width
         bars = axes.bar(x, np.nan_to_num(values), width * 0.92, label=method, color=_style(i)["color"])
         if label_bars:
-            texts = ["" if np.isnan(v) else f"{v:.0f}" for v in values]
+            texts = ["" if np.isnan(v) else f"{v:.{digits}f}" for v in values]
             axes.bar_label(bars, texts, label_type="center", color="white", fontsize=9)
     axes.grid(axis="y", alpha=0.3)
     axes.set_axisbelow(True)

@@ -33,6 +33,10 @@ _BONES_M: Final = {
 }
 _ENDS = np.array([[JOINT[a], JOINT[b]] for a, b in _BONES_M])
 _LENGTHS = np.array(list(_BONES_M.values()))
+_HEAD_ENDS = np.array([rows("right_ear", "left_ear"), rows("right_eye", "left_eye"), rows("neck", "nose")])
+_HEAD_LENGTHS = np.array([0.15, 0.063, 0.2])
+_DISTANCES = (0.5, 8.0)  # metres: of people from the camera
+_USUAL = 2.5  # metres: the distance of a person of whom nothing tells it
 # Places on the trunk: shares of (neck, right shoulder, left shoulder, right hip, left hip).
 _PLACES = np.array(
     [
@@ -62,13 +66,14 @@ class Root:
 
 
 def find_root(person: Keypoints2D, depth: RegisteredDepth, camera: Camera, min_score: float = 0.2) -> Root | None:
-    """None only for a person without any usable 2D keypoint.
+    """None only for a person without any 2D keypoint (through which the camera has a ray).
 
     min_score: keypoints with a lower score are not used, unless there are no others.
     """
-    usable = person.found & (person.score >= min_score)
+    found = person.found & np.isfinite(camera.normalized(person.uv)).all(1)
+    usable = found & (person.score >= min_score)
     if usable.sum() < 2:
-        usable = person.found
+        usable = found
     if not usable.any():
         return None
     uv = np.where(usable[:, None], person.uv, np.nan)
@@ -82,9 +87,8 @@ def find_root(person: Keypoints2D, depth: RegisteredDepth, camera: Camera, min_s
         z, evidence = sized, "size"
     if z is None:  # one or two keypoints, and nothing to measure them by: any depth is better than none
         values = nearest_depths(depth, camera, uv, k=1, radius=0.1)
-        if not np.isfinite(values).any():
-            return None
-        z, evidence = float(np.nanmedian(values)), "depth"
+        near = values[np.isfinite(values)]
+        z, evidence = (float(np.median(near)), "depth") if len(near) else (_depth_of_head(ray), "size")
     center = _center(ray, z)
     point = np.append(center * z, z)
     return Root(point * (1 + _INSIDE / np.linalg.norm(point)), evidence)
@@ -107,6 +111,13 @@ def _depth_of_size(ray: Float[np.ndarray, "18 2"]) -> float | None:
         return None
     some = ratio[1:5] if len(ratio) > 4 else ratio[:2]  # the longest of many is often a misplaced keypoint
     return float(1 / some.mean())
+
+
+def _depth_of_head(ray: Float[np.ndarray, "18 2"]) -> float:
+    """As `_depth_of_size`, by the head alone; where not even that can be measured, a usual distance."""
+    length = np.linalg.norm(ray[_HEAD_ENDS[:, 0]] - ray[_HEAD_ENDS[:, 1]], axis=1)
+    ratio = length[length > 0] / _HEAD_LENGTHS[length > 0]
+    return float(np.clip(1 / ratio.max(), *_DISTANCES)) if len(ratio) else _USUAL
 
 
 def _elected(values: np.ndarray, sized: float | None) -> float | None:

@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from understudy import voxels
+from understudy.assembly import ASSEMBLIES, Rows
+from understudy.errors import UnderstudyError, one_of
 from understudy.roots import Root, find_root
 from understudy.types import INFERRED, OBSERVED, Keypoints2D, Person, RegisteredFrame
 from understudy.voxelposenet.predictor import Prediction, Predictor, keypoint_input
@@ -17,26 +19,38 @@ from understudy.voxels import PersonView
 class VoxelLifter:
     """Keypoints and depth -> 3D joints by the voxel network; every joint of everybody, hidden ones too."""
 
-    def __init__(self, min_score: float = 0.2, weights: Path | None = None):
-        """min_score: 2D keypoints with a lower score are not shown to the network."""
+    def __init__(self, min_score: float = 0.2, weights: Path | None = None, assembly: str = "uncertainty"):
+        """min_score: 2D keypoints with a lower score are not shown to the network. assembly: one of ASSEMBLIES."""
+        if assembly not in ASSEMBLIES:
+            raise UnderstudyError(f"assembly {assembly!r}: must be {one_of(ASSEMBLIES)}")
         self.min_score = min_score
         self.predictor = Predictor(weights)
+        self._assemble = ASSEMBLIES[assembly]
 
     def lift(self, frame: RegisteredFrame, people: Sequence[Keypoints2D]) -> list[Person]:
         if not people:
             return []
-        roots = [find_root(p, frame.depth, frame.camera, self.min_score) for p in people]
-        views = [PersonView.towards(r.point) for r in roots if r is not None]
-        rooted = [p for p, r in zip(people, roots, strict=True) if r is not None]
-        cloud = voxels.cloud(frame.depth)
-        depth = np.stack([v.depth_grid(cloud) for v in views]) if views else np.empty((0, 2, 64, 64), np.float32)
-        inputs = [keypoint_input(v, frame.camera, p, self.min_score) for v, p in zip(views, rooted, strict=True)]
-        predictions = iter(self.predictor(views, depth, np.array(inputs, np.float32).reshape(-1, 18, 3)))
+        roots = [find_root(person, frame.depth, frame.camera, self.min_score) for person in people]
+        lifted = iter(self._lift(frame, [(p, r) for p, r in zip(people, roots, strict=True) if r is not None]))
         return [
-            Person.failure(p, "none of its 2D keypoints is usable") if r is None else self._person(p, r, next(predictions))
-            for p, r in zip(people, roots, strict=True)
+            Person.failure(person, "no usable 2D keypoint") if root is None else next(lifted)
+            for person, root in zip(people, roots, strict=True)
         ]
 
-    def _person(self, seen: Keypoints2D, root: Root, said: Prediction) -> Person:
-        source = np.where((said.seen > 0.5) & seen.found, OBSERVED, INFERRED)
-        return Person(seen, said.joints, said.confidence, said.sigma, tuple(source.tolist()))
+    def _lift(self, frame: RegisteredFrame, rooted: Sequence[tuple[Keypoints2D, Root]]) -> list[Person]:
+        """Those who have a root, in their order."""
+        if not rooted:
+            return []
+        views = [PersonView.towards(root.point) for _, root in rooted]
+        cloud = voxels.cloud(frame.depth)
+        depth = np.stack([view.depth_grid(cloud) for view in views])
+        rows = np.stack(
+            [keypoint_input(v, frame.camera, p, self.min_score) for v, (p, _) in zip(views, rooted, strict=True)]
+        )
+        said = self.predictor(views, depth, rows)
+        return [self._person(p, *each) for (p, _), *each in zip(rooted, views, rows, said, strict=True)]
+
+    def _person(self, seen: Keypoints2D, view: PersonView, rows: Rows, said: Prediction) -> Person:
+        joints = view.to_cam(self._assemble(said, rows, view))
+        source = np.where((said.seen > 0.5) & (rows[:, 2] > 0), OBSERVED, INFERRED)
+        return Person(seen, joints, said.confidence, said.sigma, tuple(source.tolist()))

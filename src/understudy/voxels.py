@@ -55,8 +55,17 @@ class PersonView:
 
     def to_cam(self, view: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
         """View coordinates -> colour camera's frame, metres."""
+        return self.to_view_frame(view) @ self.R_view_cam
+
+    def to_view_frame(self, view: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+        """View coordinates -> metres in the virtual camera's frame, where lengths are true."""
         z = np.maximum(view[..., 2:] + self.root_z, _NEAREST_Z)
-        return np.concatenate([view[..., :2] * (z / self.root_z), z], -1) @ self.R_view_cam
+        return np.concatenate([view[..., :2] * (z / self.root_z), z], -1)
+
+    def from_view_frame(self, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+        """The inverse of `to_view_frame`."""
+        z = np.maximum(points[..., 2:], _NEAREST_Z)
+        return np.concatenate([points[..., :2] / z * self.root_z, points[..., 2:] - self.root_z], -1)
 
     def columns(self, camera: Camera, uv: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
         """x and y in view coordinates of image points (colour pixels); NaN where the camera has no ray."""

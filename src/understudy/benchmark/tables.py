@@ -111,7 +111,7 @@ def markdown(rows: Sequence[Row], environment: Mapping[str, object], matching: s
         if block[0].evaluation.palms.n_truth:
             parts.append(_markdown_table(block, PALM_COLUMNS))
         parts.append(_joint_table(block))
-    parts += ["## What the numbers mean", _definitions(matching), "## Where it ran", _environment(environment)]
+    parts += ["## What the numbers mean", _definitions(matching), "## Where it ran", environment_lines(environment)]
     return "\n\n".join(parts) + "\n"
 
 
@@ -146,10 +146,11 @@ def _aligned(cells: Sequence[Sequence[str]]) -> str:
 
 def _markdown_table(rows: Sequence[Row], columns: Sequence[Column]) -> str:
     heads = ["method", *(f"{c.head} {c.unit}".strip() for c in columns)]
-    return _markdown_lines(heads, [_cells(row, columns) for row in rows])
+    return markdown_lines(heads, [_cells(row, columns) for row in rows])
 
 
-def _markdown_lines(heads: Sequence[str], cells: Iterable[Sequence[str]]) -> str:
+def markdown_lines(heads: Sequence[str], cells: Iterable[Sequence[str]]) -> str:
+    """A Markdown table: first column to the left, the others to the right."""
     rule = ["---", *(["---:"] * (len(heads) - 1))]
     return "\n".join("| " + " | ".join(x.replace("|", "\\|") for x in line) + " |" for line in (heads, rule, *cells))
 
@@ -163,7 +164,7 @@ def _joint_table(rows: Sequence[Row]) -> str:
         cells.append(
             [joint.replace("_", " "), *(f"{number(100 * m.epe_m, 1)} ({number(100 * m.coverage, 0)})" for m in metrics)]
         )
-    return _markdown_lines(heads, cells)
+    return markdown_lines(heads, cells)
 
 
 def _definitions(matching: str) -> str:
@@ -177,7 +178,7 @@ def _definitions(matching: str) -> str:
     return "\n".join(f"- {line}" for line in lines)
 
 
-def _environment(environment: Mapping[str, object]) -> str:
+def environment_lines(environment: Mapping[str, object]) -> str:
     def words(value: object) -> str:
         if isinstance(value, Mapping):
             return ", ".join(f"{k} {v}" for k, v in value.items() if v is not None)

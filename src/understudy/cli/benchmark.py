@@ -22,7 +22,9 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument(
         "recordings", nargs="+", metavar="RECORDING", help="with truth.json; 'sample' is the bundled one"
     )
-    parser.add_argument("--methods", nargs="+", default=["voxelposenet", "naive"], metavar="METHOD", help="default: both")
+    parser.add_argument(
+        "--methods", nargs="+", default=["voxelposenet", "naive"], metavar="METHOD", help="default: both"
+    )
     parser.add_argument("--detector", default="blazepose", metavar="NAME", help="as in `understudy estimate`")
     parser.add_argument("--out", type=Path, default=Path("benchmark"), metavar="DIR", help="default: benchmark")
     parser.add_argument("--resume", action="store_true", help="keep what an earlier run has estimated")

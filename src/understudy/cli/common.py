@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from understudy.errors import UnderstudyError
+from understudy.errors import MissingExtraError, UnderstudyError
 
 if TYPE_CHECKING:
     from understudy.recordings.base import Recording
@@ -60,3 +62,16 @@ def open_recording(arguments: argparse.Namespace) -> Recording:
         arguments.intrinsics,
         unit_m=0.001 if arguments.unit is None else arguments.unit,
     )
+
+
+@contextmanager
+def needs_extra(feature: str, extra: str) -> Iterator[None]:
+    """Around imports: a package that is not installed becomes a MissingExtraError. Our own modules are not missing."""
+    try:
+        yield
+    except MissingExtraError:
+        raise
+    except ImportError as e:
+        if (e.name or "").partition(".")[0] == "understudy":
+            raise
+        raise MissingExtraError(feature, extra) from e

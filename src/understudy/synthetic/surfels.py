@@ -47,23 +47,23 @@ class Surfels:
         return Surfels(self.points @ R.T + t, self.normals @ R.T, self.radius, self.values)
 
 
-def neighbours(points: Float[Tensor, "p 3"], segment: Int[Tensor, " p"], count: int = 6) -> Int[Tensor, "p k"]:
-    """The nearest points of each point that belong to the same rigid segment."""
-    out = torch.empty(len(points), count, dtype=torch.long, device=points.device)
-    for s in segment.unique():
-        rows = (segment == s).nonzero()[:, 0]
-        distance = torch.cdist(points[rows], points[rows])
-        distance.fill_diagonal_(torch.inf)
-        k = min(count, len(rows) - 1)
-        near = rows[distance.topk(k, largest=False).indices] if k else rows[:, None]
-        out[rows] = near[:, torch.arange(count, device=points.device) % max(k, 1)]
-    return out
+def neighbours(points: Float[Tensor, "p 3"], normals: Float[Tensor, "p 3"], count: int = 6) -> Int[Tensor, "p {count}"]:
+    """The nearest points of each point whose normals point roughly the same way."""
+    out = []
+    for rows in torch.arange(len(points), device=points.device).split(1024):
+        distance = torch.cdist(points[rows], points)
+        distance[(normals[rows] @ normals.T < 0.3) | (rows[:, None] == torch.arange(len(points)).to(rows))] = 9.0
+        out.append(distance.topk(count, largest=False).indices)
+    return torch.cat(out)
 
 
-def radii(points: Float[Tensor, "p 3"], near: Int[Tensor, "p k"]) -> Float[Tensor, " p"]:
-    """Radii (metres) of discs that cover the surface, from how far the neighbours are now."""
+def radii(
+    points: Float[Tensor, "p 3"], near: Int[Tensor, "p k"], most: Float[Tensor, " p"] | None = None
+) -> Float[Tensor, " p"]:
+    """Radii (metres) of discs that cover the surface, from how far the neighbours are now. most: upper limits."""
     distance = (points[near] - points[:, None]).norm(dim=-1)
-    return (_COVER * distance.mean(1)).clamp(*_RADII)
+    radius = (_COVER * distance.mean(1)).clamp(*_RADII)
+    return radius if most is None else torch.minimum(radius, most)
 
 
 def draw(surfels: Surfels, camera: Camera) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w c3"]]:

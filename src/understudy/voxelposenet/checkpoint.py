@@ -31,11 +31,11 @@ def load_net(path: Path) -> VoxelPoseNet:
     tensors, words = _read(path)
     if words.get("format") != FORMAT:
         raise ModelFileError(f"{path}: format is {words.get('format')!r}, must be {FORMAT!r}")
-    sizes = json.loads(words["net"])
-    net = VoxelPoseNet(NetConfig(**{**sizes, "channels": tuple(sizes["channels"])}))
     try:
+        sizes = json.loads(words["net"])
+        net = VoxelPoseNet(NetConfig(**{**sizes, "channels": tuple(sizes["channels"])}))
         net.load_state_dict(tensors)
-    except RuntimeError as e:
+    except (RuntimeError, KeyError, TypeError, ValueError) as e:
         raise ModelFileError(f"{path}: the weights do not fit the network that the file describes: {e}") from e
     return net.eval()
 
@@ -59,8 +59,24 @@ def save_checkpoint(
 def load_checkpoint(
     path: Path, net: torch.nn.Module, average: dict[str, Tensor], optimizer: torch.optim.Optimizer
 ) -> tuple[int, float]:
-    """Puts back what `save_checkpoint` wrote; returns the step and the seconds of training so far."""
+    """Puts back what `save_checkpoint` wrote; returns the step and the seconds of training so far.
+
+    Raises ModelFileError for a damaged file, or one of another network.
+    """
     tensors, words = _read(path)
+    try:
+        return _restore(tensors, words, net, average, optimizer)
+    except (RuntimeError, KeyError, ValueError) as e:
+        raise ModelFileError(f"{path}: not a checkpoint of this network: {e}") from e
+
+
+def _restore(
+    tensors: Mapping[str, Tensor],
+    words: Mapping[str, str],
+    net: torch.nn.Module,
+    average: dict[str, Tensor],
+    optimizer: torch.optim.Optimizer,
+) -> tuple[int, float]:
     parts: dict[str, dict[str, Tensor]] = {"net": {}, "average": {}, "optimizer": {}}
     for name, tensor in tensors.items():
         part, _, rest = name.partition("/")
@@ -68,13 +84,23 @@ def load_checkpoint(
     net.load_state_dict(parts["net"])
     for k, v in parts["average"].items():
         average[k].copy_(v)
+    parameters = dict(enumerate(p for group in optimizer.param_groups for p in group["params"]))
     state: dict[int, dict[str, Tensor]] = {}
     for name, tensor in parts["optimizer"].items():
         i, _, k = name.partition("/")
-        state.setdefault(int(i), {})[k] = tensor
+        state.setdefault(int(i), {})[k] = _laid_out_as(parameters[int(i)], tensor)
     if state:
         optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})
     return int(words["step"]), float(words["seconds"])
+
+
+def _laid_out_as(parameter: Tensor, value: Tensor) -> Tensor:
+    """The value in the parameter's order in memory. The fused optimiser walks both in memory's order without looking
+    at strides: a plain copy beside a channels-last parameter would silently exchange elements.
+    """
+    if value.shape != parameter.shape:
+        return value
+    return torch.empty_like(parameter, dtype=value.dtype).copy_(value)
 
 
 def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from collections.abc import Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from torch.utils.data import Dataset
 
-from understudy.errors import UnderstudyError, one_of
+from understudy.errors import MissingExtraError, UnderstudyError, one_of
 from understudy.synthetic.bodies import load_bank
 from understudy.synthetic.samples import Batch, SampleConfig, Samples
+from understudy.synthetic.sensors import SENSORS
 
 BODY_SETS = ("anny", "capsules", "both")
 
@@ -30,16 +31,20 @@ class DataConfig:
     bvh: str | None = None
     """folder of motion capture that poses are drawn from, in place of sampled postures"""
 
-    def json(self) -> dict[str, Any]:
-        return asdict(self)
+    def __post_init__(self) -> None:
+        if self.bodies not in BODY_SETS:
+            raise UnderstudyError(f"bodies {self.bodies!r}: must be {one_of(BODY_SETS)}")
+        if self.anny < 1 or self.capsules < 1:
+            raise UnderstudyError(f"anny {self.anny}, capsules {self.capsules}: must be at least 1")
+        unknown = [name for name in self.samples.sensors if name not in SENSORS]
+        if unknown or not self.samples.sensors:
+            raise UnderstudyError(f"sensors {self.samples.sensors!r}: must be some of {', '.join(SENSORS)}")
 
 
 class Batches(Dataset[Batch]):
     """Batch `i` is a function of the configuration, the seed and `i`."""
 
     def __init__(self, config: DataConfig, size: int, seed: int, count: int):
-        if config.bodies not in BODY_SETS:
-            raise UnderstudyError(f"bodies {config.bodies!r}: must be {one_of(BODY_SETS)}")
         self.size, self.count = size, count
         poses = None
         if config.bvh:
@@ -49,11 +54,19 @@ class Batches(Dataset[Batch]):
 
             poses = torch.as_tensor(load_folder(Path(config.bvh))).float()
         wanted = {"anny": config.anny, "capsules": config.capsules}
-        banks = {k: load_bank(k, n, config.bodies_seed) for k, n in wanted.items() if config.bodies in (k, "both")}
+        try:
+            banks = {k: load_bank(k, n, config.bodies_seed) for k, n in wanted.items() if config.bodies in (k, "both")}
+        except MissingExtraError:
+            raise
+        except ImportError as e:
+            raise MissingExtraError(f"bodies of the set {config.bodies!r}", "train") from e
         self._samples = [Samples(bank, config.samples, seed + 7 * k, poses) for k, bank in enumerate(banks.values())]
 
     def __len__(self) -> int:
         return self.count
+
+    def __iter__(self) -> Iterator[Batch]:
+        return (self[i] for i in range(self.count))
 
     def __getitem__(self, number: int) -> Batch:
         if number >= self.count:

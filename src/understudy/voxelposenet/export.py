@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import warnings
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -25,7 +26,7 @@ def export_onnx(net: VoxelPoseNet, path: Path, half: bool = True) -> None:
     import onnx
 
     example = (torch.rand(2, 2, CELLS, CELLS), torch.rand(2, 18, 3), torch.full((2, 1), 3.0))
-    buffer = io.BytesIO()
+    buffer: Any = io.BytesIO()  # the exporter's annotation knows paths only
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the exporter's own deprecation and tracing notes
         torch.onnx.export(

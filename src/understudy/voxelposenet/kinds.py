@@ -34,7 +34,10 @@ class Estimate(NamedTuple):
 class Kind(Protocol):
     """One network, as training sees it."""
 
-    net: nn.Module
+    @property
+    def net(self) -> nn.Module:
+        """The network that is trained."""
+        ...
 
     def learn(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
         """The loss, and its parts for the log; `error` among them is the mean error in metres, where it is known."""
@@ -64,7 +67,7 @@ class DefaultKind:
         net = VoxelPoseNet(self.config.net).to(device)
         for module in net.modules():
             if isinstance(module, nn.Conv3d | nn.ConvTranspose3d):
-                module.to(memory_format=torch.channels_last_3d)
+                module.to(memory_format=torch.channels_last_3d)  # type: ignore[call-overload]
         return net
 
     def learn(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
@@ -95,14 +98,18 @@ class PaperKind:
         made = paper_data.paper_batch(batch, self.config.grid)
         with torch.autocast(batch.depth.device.type, torch.bfloat16, enabled=self.config.bf16):
             volumes = self.net(made.input)
-        total = paper_loss(tuple(v.float() for v in volumes), made.index)
+        total = paper_loss(tuple(v.float() for v in volumes), made.cells)
         metres, _ = paper_data.peaks(volumes[-1].detach().float(), made.origin)
         away = (metres - paper_data.to_metres(batch.joints, batch.root_z)).norm(dim=-1)
         return total, {"error": away.mean(), "rooted": made.rooted.float().mean()}
 
     def estimate(self, net: nn.Module, batch: Batch) -> Estimate:
-        made = paper_data.paper_batch(batch, self.config.grid)
-        metres, score = paper_data.peaks(net(made.input)[-1], made.origin)
+        volumes, origins = [], []
+        for i in range(len(batch.depth)):  # one by one: a person takes a gigabyte
+            made = paper_data.paper_batch(Batch(*(t[i : i + 1] for t in batch)), self.config.grid)
+            volumes.append(net(made.input)[-1])
+            origins.append(made.origin)
+        metres, score = paper_data.peaks(torch.cat(volumes), torch.cat(origins))
         sigma = sigma_of_score(score.cpu().numpy(), paper_data.cell_size(self.config.grid))
         joints = paper_data.assembled(metres, score, batch)
         return Estimate(joints, torch.as_tensor(sigma, dtype=score.dtype, device=score.device), score.clamp(0, 1))

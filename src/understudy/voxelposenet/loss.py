@@ -28,8 +28,8 @@ def loss(
     """One number to minimise, and its parts.
 
     Cross-entropy with the true cell (spread over the 8 nearest), plus the L1 distance of the mean from the truth in
-    metres; for the judge, the quantile loss that makes sigma hold 68 % of the errors, and cross-entropies of 'within 10 cm' and
-    'seen'. Joints outside of the grid only teach the judge.
+    metres; for the judge, the quantile loss that makes sigma hold 68 % of the errors, and cross-entropies of 'within
+    10 cm' and 'seen'. Joints outside of the grid only teach the judge.
     """
     inside = (joints.abs() < HALF - 0.5 * _STEP).all(-1)
     weight = inside.float() / inside.sum().clamp_min(1)
@@ -52,7 +52,9 @@ def loss(
     return total, {**parts, "error": (error * weight).sum()}
 
 
-def metric_error(estimate: Float[Tensor, "b n 3"], truth: Float[Tensor, "b n 3"], root_z: Float[Tensor, "b 1"]) -> Tensor:
+def metric_error(
+    estimate: Float[Tensor, "b n 3"], truth: Float[Tensor, "b n 3"], root_z: Float[Tensor, "b 1"]
+) -> Tensor:
     """Euclidean distance in metres of two places in view coordinates; (b, n)."""
     return (_metric(estimate, root_z) - _metric(truth, root_z)).norm(dim=-1)
 

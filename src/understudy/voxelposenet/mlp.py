@@ -30,7 +30,7 @@ from understudy.voxelposenet.loss import COVERED, WITHIN, _distance, metric_erro
 from understudy.voxels import HALF
 
 _FRESH = 64  # new people per round
-_ROUND = 10  # steps of optimisation per round
+_ROUND = 25  # steps of optimisation per round
 _BATCH = 256  # people per step, from all so far
 _POOL = 200_000  # people that are kept
 
@@ -176,13 +176,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="python -m understudy.voxelposenet.mlp", description=main.__doc__)
     parser.add_argument("out", type=Path, help="file to write (safetensors)")
     parser.add_argument("--minutes", type=float, default=None, help="wall time (default: by --steps)")
-    parser.add_argument("--steps", type=int, default=None, help="steps of 256 people; reproducible (default 12000)")
+    parser.add_argument("--steps", type=int, default=None, help="steps of 256 people; reproducible (default 20000)")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--bodies", default="both", help="body set: anny, capsules, both")
     parser.add_argument("--threads", type=int, default=2)
     chosen = parser.parse_args(arguments)
     torch.set_num_threads(chosen.threads)
-    steps = 12_000 if chosen.minutes is None and chosen.steps is None else chosen.steps
+    steps = 20_000 if chosen.minutes is None and chosen.steps is None else chosen.steps
     train_mlp(
         chosen.out, minutes=chosen.minutes, steps=steps, seed=chosen.seed,
         data=DataConfig(bodies=chosen.bodies), progress=True,

@@ -1,8 +1,9 @@
 """The default network (torch): a person's view grid and 2D keypoints -> one distribution per joint -> 3D joints.
 
-Made for a CPU. What the paper does at 64^3 with 64 channels happens here at 16^3: the occupancy grid is folded 4 x 4 x 4
-cells into channels, and everything that is constant along z (the score maps) passes through a 2D trunk whose result is
-added to the 3D features. The last layer unfolds to 32^3 scores per joint; their softmax is the joint's distribution.
+Made for a CPU. What the paper does at 64^3 with 64 channels happens here at 16^3: the occupancy grid is folded
+4 x 4 x 4 cells into channels, and everything that is constant along z (the score maps) passes through a 2D trunk whose
+result is added to the 3D features. The last layer unfolds to 32^3 scores per joint; their softmax is the joint's
+distribution.
 All inputs and outputs are in the coordinates of `understudy.voxels.PersonView`.
 """
 
@@ -60,13 +61,19 @@ class _Residual(nn.Module):
         return F.relu(x + self.b(self.a(x)))
 
 
-def _block(conv: type[nn.Module], norm: type[nn.Module], inputs: int, outputs: int, size: int, stride: int) -> nn.Module:
+def _block(
+    conv: type[nn.Module], norm: type[nn.Module], inputs: int, outputs: int, size: int, stride: int
+) -> nn.Module:
     layer = conv(inputs, outputs, size, stride=stride, padding=size // 2 if size % 2 else 0, bias=False)
     return nn.Sequential(layer, norm(outputs), nn.ReLU())
 
 
 class VoxelPoseNet(nn.Module):
     """See the module's text."""
+
+    centers: Tensor
+    fine: Tensor
+    coarse: Tensor
 
     def __init__(self, config: NetConfig | None = None):
         super().__init__()

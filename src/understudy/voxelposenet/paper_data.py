@@ -40,7 +40,7 @@ class PaperBatch(NamedTuple):
 
     input: Float[Tensor, "b 19 s s s"]
     """occupancy, then score maps of the joints"""
-    index: Float[Tensor, "b 18 3"]
+    cells: Float[Tensor, "b 18 3"]
     """the true joints in cells (integers are centres); NaN for people without a root"""
     origin: Float[Tensor, "b 3"]
     """the grid's corner of least x, y, z: metres, view's frame (its camera is the origin)"""
@@ -58,8 +58,8 @@ def paper_batch(batch: Batch, size: int = SIZE) -> PaperBatch:
     root, low, rooted = _roots(batch)
     origin = root + low
     grid = torch.cat([_occupancy(batch, origin, size)[:, None], _score_maps(batch, root, origin, size)], 1)
-    index = (to_metres(batch.joints, batch.root_z) - origin[:, None]) / cell - 0.5
-    return PaperBatch(grid, torch.where(rooted[:, None, None], index, torch.nan), origin, rooted)
+    cells = (to_metres(batch.joints, batch.root_z) - origin[:, None]) / cell - 0.5
+    return PaperBatch(grid, torch.where(rooted[:, None, None], cells, torch.nan), origin, rooted)
 
 
 def to_metres(view: Float[Tensor, "b n 3"], root_z: Float[Tensor, "b 1"]) -> Float[Tensor, "b n 3"]:
@@ -84,9 +84,7 @@ def peaks(
     return origin[:, None] + (place + 0.5) * cell_size(size), score
 
 
-def assembled(
-    metres: Float[Tensor, "b 18 3"], score: Float[Tensor, "b 18"], batch: Batch
-) -> Float[Tensor, "b 18 3"]:
+def assembled(metres: Float[Tensor, "b 18 3"], score: Float[Tensor, "b 18"], batch: Batch) -> Float[Tensor, "b 18 3"]:
     """The paper's result in view coordinates: where the 2D score exceeds the 3D score, the 2D keypoint at the network's
     depth, else the network's position. metres, score: of `peaks`.
     """

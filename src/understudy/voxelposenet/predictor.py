@@ -19,7 +19,7 @@ WEIGHTS = "voxelposenet.onnx"
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """What the network says of one person, in the colour camera's frame."""
+    """What the network says of one person, in view coordinates (understudy.voxels)."""
 
     joints: Float[np.ndarray, "18 3"]
     """metres"""
@@ -57,13 +57,13 @@ class Predictor:
         joints, spread, head = self.network(depth=depth, keypoints=keypoints, root_z=root_z)
         return [
             Prediction(
-                view.to_cam(j.astype(np.float64)),
+                j.astype(np.float64),
                 s.astype(np.float64),
                 np.exp(h[:, 0].astype(np.float64)),
                 _sigmoid(h[:, 1]),
                 _sigmoid(h[:, 2]),
             )
-            for view, j, s, h in zip(views, joints, spread, head, strict=True)
+            for j, s, h in zip(joints, spread, head, strict=True)
         ]
 
 

@@ -4,17 +4,27 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields, is_dataclass
+from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from types import MappingProxyType
-from typing import Any, Final, TypeVar
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from understudy.errors import UnderstudyError, one_of
 from understudy.voxelposenet.data import DataConfig
 from understudy.voxelposenet.net import NetConfig
 
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
 NETWORKS: Final = ("default", "paper", "paper-fast")
 SCHEDULES: Final = ("cosine", "steps")
-_AT_LEAST = {"steps": 1, "batch": 1, "validation_samples": 1, "validate_every": 1, "checkpoint_every": 1, "log_every": 1}
+_AT_LEAST = {
+    "steps": 1,
+    "batch": 1,
+    "validation_samples": 1,
+    "validate_every": 1,
+    "checkpoint_every": 1,
+    "log_every": 1,
+}
 _AT_LEAST |= {"warmup": 0, "weight_decay": 0, "ema": 0, "clip": 0, "seed": 0, "workers": 0, "decay_every": 1}
 _AT_LEAST |= {"learning_rate": 0, "grid": 8}
 
@@ -107,7 +117,7 @@ PRESETS: Final = MappingProxyType(
 FREE: Final = ("steps", "workers", "device", "checkpoint_every", "log_every", "validate_every", "plots")
 """What may change when a run goes on."""
 
-T = TypeVar("T")
+T = TypeVar("T", bound="DataclassInstance")
 
 
 def from_json(data: Mapping[str, Any], base: T, where: str) -> T:
@@ -115,21 +125,20 @@ def from_json(data: Mapping[str, Any], base: T, where: str) -> T:
 
     Raises UnderstudyError that begins with `where` and names the field.
     """
-    assert is_dataclass(base)
     known = {f.name for f in fields(base)}
     changed: dict[str, Any] = {}
     for name, value in data.items():
         if name not in known:
             raise UnderstudyError(f"{where}: there is no {name!r}; must be {one_of(sorted(known))}")
         old = getattr(base, name)
-        if is_dataclass(old):
+        if is_dataclass(old) and not isinstance(old, type):
             if not isinstance(value, Mapping):
                 raise UnderstudyError(f"{where}: {name!r} must be an object, got {value!r}")
             changed[name] = from_json(value, old, f"{where}: {name}")
         else:
             changed[name] = _value(value, old, f"{where}: {name!r}")
     try:
-        return type(base)(**{f.name: changed.get(f.name, getattr(base, f.name)) for f in fields(base)})
+        return replace(base, **changed)
     except UnderstudyError as e:
         raise UnderstudyError(f"{where}: {e}") from e
 
@@ -138,7 +147,9 @@ def _value(value: Any, old: Any, where: str) -> Any:
     """A value of the kind that the field has."""
     if isinstance(old, tuple):
         kinds = {type(v) for v in old}
-        if isinstance(value, list | tuple) and all(type(v) in kinds or (type(v) is int and float in kinds) for v in value):
+        if isinstance(value, list | tuple) and all(
+            type(v) in kinds or (type(v) is int and float in kinds) for v in value
+        ):
             return tuple(value)
         raise UnderstudyError(f"{where} must be a list like {list(old)}, got {value!r}")
     if isinstance(old, float) and type(value) is int:

@@ -13,17 +13,14 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import platform
 import signal
 import sys
-import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 import torch
@@ -37,6 +34,7 @@ from understudy.synthetic.sensors import SENSORS
 from understudy.voxelposenet import curves, kinds, records, validation
 from understudy.voxelposenet.checkpoint import load_checkpoint, save_checkpoint
 from understudy.voxelposenet.data import Batches
+from understudy.voxelposenet.processes import Stop, World
 from understudy.voxelposenet.train_config import PRESETS, TrainConfig, differences, from_json
 
 __all__ = ["PRESETS", "TrainConfig", "Trainer", "read_config"]
@@ -59,65 +57,12 @@ class _Numbers(Sampler[int]):
         return len(self.numbers)
 
 
-@dataclass(frozen=True)
-class _World:
-    """The processes that train together (torchrun); one when started without it."""
-
-    device: torch.device
-    rank: int = 0
-    size: int = 1
-
-    @classmethod
-    def join(cls, device: str) -> _World:
-        here = torch.device(device)
-        if here.type == "cuda" and not torch.cuda.is_available():
-            raise UnderstudyError(f"device {device!r}: this machine, or this build of torch, has no CUDA device")
-        if int(os.environ.get("WORLD_SIZE", "1")) < 2:
-            return cls(here)
-        if here.type == "cuda":
-            here = torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0")))
-            torch.cuda.set_device(here)
-        if not torch.distributed.is_initialized():
-            torch.distributed.init_process_group("nccl" if here.type == "cuda" else "gloo")
-        return cls(here, torch.distributed.get_rank(), torch.distributed.get_world_size())
-
-    def any(self, here: bool) -> bool:
-        """Whether it is so in any of the processes; all must ask."""
-        if self.size == 1:
-            return here
-        flag = torch.tensor(int(here), device=self.device)
-        torch.distributed.all_reduce(flag, torch.distributed.ReduceOp.MAX)
-        return bool(flag)
-
-
-class _Stop:
-    """Ctrl-C and SIGTERM wait until a step is done; a second one does not."""
-
-    def __init__(self) -> None:
-        self.asked = False
-        self._before: dict[int, Any] = {}
-
-    def __enter__(self) -> _Stop:
-        if threading.current_thread() is threading.main_thread():
-            self._before = {s: signal.signal(s, self._ask) for s in (signal.SIGINT, signal.SIGTERM)}
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for number, handler in self._before.items():
-            signal.signal(number, handler)
-
-    def _ask(self, number: int, frame: FrameType | None) -> None:
-        if self.asked:
-            raise KeyboardInterrupt
-        self.asked = True
-
-
 class Trainer:
     """One training run. `run` returns when the last step is done; an interruption loses nothing."""
 
     def __init__(self, config: TrainConfig, out: Path):
         self.config, self.out = config, Path(out)
-        self.world = _World.join(config.device)
+        self.world = World.join(config.device)
         torch.manual_seed(config.seed)
         self.kind = kinds.make(config, self.world.device)
         self.net = self.kind.net
@@ -127,6 +72,7 @@ class Trainer:
         self.optimizer = torch.optim.AdamW(groups, lr=config.learning_rate, fused=True)
         self.average = {k: v.detach().clone() for k, v in self.net.state_dict().items()}
         self.step, self.seconds = 0, 0.0
+        self._saved = -1  # step of the checkpoint on disk
         self._prepare()
 
     def _prepare(self) -> None:
@@ -140,13 +86,14 @@ class Trainer:
                 )
         if (self.out / CHECKPOINT).exists():
             self.step, self.seconds = load_checkpoint(self.out / CHECKPOINT, self.net, self.average, self.optimizer)
+            self._saved = self.step
         if self.world.size > 1:
             torch.distributed.barrier()  # all have read what the first one now writes
         if self.world.rank == 0:
             for name in (records.LOG, records.VALIDATION, *records.TABLES.values()):
                 records.keep_until(self.out / name, self.step)
             machine = platform.processor() or platform.machine()
-            about = {"config": asdict(self.config), "command": sys.argv, "torch": torch.__version__}
+            about: dict[str, Any] = {"config": asdict(self.config), "command": sys.argv, "torch": torch.__version__}
             about |= {"machine": machine, "processes": self.world.size}
             write_atomically(path, json.dumps(about, indent=1) + "\n")
 
@@ -167,7 +114,7 @@ class Trainer:
         batches = Batches(config.data, config.batch, config.seed, 2**62)
         numbers = _Numbers(self.step, config.steps, self.world.rank, self.world.size)
         start, seconds, sums, since = time.monotonic(), self.seconds, dict[str, Tensor](), 0
-        with _Stop() as stop:
+        with Stop() as stop:
             self._validate(report, stop)  # when an interruption came between a step and its validation
             loader = DataLoader(batches, batch_size=None, sampler=numbers, num_workers=config.workers,
                                 prefetch_factor=4 if config.workers else None, worker_init_fn=_worker)  # fmt: skip
@@ -234,7 +181,7 @@ class Trainer:
     def _when(self) -> dict[str, Any]:
         return {"step": self.step, "hours": round(self.seconds / 3600, 4)}
 
-    def _validate(self, report: Callable[[dict[str, Any]], object], stop: _Stop) -> None:
+    def _validate(self, report: Callable[[dict[str, Any]], object], stop: Stop) -> None:
         """Validates in the first process, if it is time to and has not been done."""
         due = self.step > 0 and (self.step % self.config.validate_every == 0 or self.step == self.config.steps)
         if not due or self.world.rank:
@@ -245,7 +192,7 @@ class Trainer:
 
         def unless_stopped(batches: Batches) -> Iterator[Batch]:
             for batch in batches:
-                if stop.asked:
+                if stop.asked and self.world.size == 1:  # together, all stop after the next step
                     raise KeyboardInterrupt
                 yield Batch(*(t.to(self.world.device) for t in batch))
 
@@ -268,15 +215,15 @@ class Trainer:
         counts = {k: min(n, getattr(data, k)) for k, n in _VALIDATION_BODIES.items()}
         samples = replace(data.samples, sensors=tuple(SENSORS))
         data = replace(data, bodies_seed=data.bodies_seed + 1000, samples=samples, **counts)
-        size = min(_VALIDATION_BATCH, self.config.batch) if self.config.network != "default" else _VALIDATION_BATCH
-        count = math.ceil(self.config.validation_samples / size)
-        return Batches(data, size, self.config.validation_seed, count)
+        count = math.ceil(self.config.validation_samples / _VALIDATION_BATCH)
+        return Batches(data, _VALIDATION_BATCH, self.config.validation_seed, count)
 
     def _save(self) -> None:
-        if self.world.rank:
+        if self.world.rank or self._saved == self.step:
             return
         save_checkpoint(self.out / CHECKPOINT, self.net, self.average, self.optimizer, self.step, self.seconds)
         self.kind.save(self.out / WEIGHTS, self.average, {"step": str(self.step)})
+        self._saved = self.step
 
 
 class _Learning(nn.Module):
