@@ -4,8 +4,8 @@
         --paper-fast WEIGHTS --runs "anny=RUN capsules=RUN both=RUN" --held-out "realsense=RUN" --recordings DIR...
 
 What is absent is left out, and the page says so. All that was computed stays in the cache: started again, it goes on
-where it stopped. The MLP is trained by `python -m understudy.voxelposenet.mlp`, the offsets of naive lifting are fitted with
---fit-offsets.
+where it stopped. The MLP is trained by `python -m understudy.voxelposenet.mlp`; --fit-offsets fits the offsets of
+naive lifting.
 """
 
 from __future__ import annotations

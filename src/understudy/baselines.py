@@ -1,6 +1,6 @@
 """Methods that the voxel network must beat, as lifters (numpy): naive lifting with offsets, and a small MLP.
 
-    python -m understudy.baselines RECORDING...
+    python benchmarks/paper_tables.py --fit-offsets    or    python -m understudy.baselines RECORDING...
 
 fits the offsets of `NaiveOffsetLifter` anew on recordings with truth (simulated ones: `understudy synth`).
 """
@@ -32,10 +32,12 @@ if TYPE_CHECKING:
 # --- naive lifting with offsets ---
 
 OFFSETS_M: Final[Mapping[str, float]] = {
-    "nose": 0.0, "neck": 0.0, "shoulder": 0.0, "elbow": 0.0, "wrist": 0.0,
-    "hip": 0.0, "knee": 0.0, "ankle": 0.0, "eye": 0.0, "ear": 0.0,
+    "nose": 0.003, "neck": 0.117, "shoulder": 0.063, "elbow": 0.061, "wrist": 0.032,
+    "hip": 0.124, "knee": 0.070, "ankle": 0.047, "eye": 0.008, "ear": 0.007,
 }  # fmt: skip
-"""Kind of joint -> metres along the ray from the surface that naive lifting finds to the joint."""
+"""Kind of joint -> metres along the ray from the surface that naive lifting finds to the joint. Made by
+`python benchmarks/paper_tables.py --fit-offsets --frames 4`: simulated recordings with the training's bodies.
+"""
 
 
 class NaiveOffsetLifter:
@@ -64,8 +66,8 @@ def kind(joint: str) -> str:
 def fit_offsets(
     naive: Float[np.ndarray, "n 18 3"], truth: Float[np.ndarray, "n 18 3"], visible: Bool[np.ndarray, "n 18"]
 ) -> dict[str, float]:
-    """Offsets (metres) by kind of joint: the median, over visible joints that were lifted, of how much farther along the
-    ray of the lifted joint the true one lies. Left and right share one. A kind that nobody shows gets 0.
+    """Offsets (metres) by kind of joint: the median, over visible joints that were lifted, of how much farther along
+    the ray of the lifted joint the true one lies. Left and right share one. A kind that nobody shows gets 0.
     """
     ray = naive / np.linalg.norm(naive, axis=-1, keepdims=True)
     farther = ((truth - naive) * ray).sum(-1)

@@ -35,7 +35,9 @@ def require_matplotlib() -> None:
 
 def pck_curves(evaluations: Mapping[str, Evaluation], title: str) -> bytes:
     """Share of joints within a distance, per method: all, visible and occluded joints. Joints left out are wrong."""
-    figure = _figure(12, 5.4, f"Joints within a distance of the truth: {title}")
+    columns = 2 if max(map(len, evaluations), default=0) <= 14 else 1
+    height = 5.4 + 0.2 * max(0, len(evaluations) - 2 * columns)
+    figure = _figure(12, height, f"Joints within a distance of the truth: {title}")
     panels = np.atleast_1d(figure.subplots(1, 3, sharey=True))
     for axes, joints in zip(panels, ("all", "visible", "occluded"), strict=True):
         for i, (method, evaluation) in enumerate(evaluations.items()):
@@ -49,7 +51,7 @@ def pck_curves(evaluations: Mapping[str, Evaluation], title: str) -> bytes:
         axes.set_xticks(range(0, 21, 5))
         axes.grid(alpha=0.3)
         if axes.lines[:-1]:
-            axes.legend(title="method  AUC", loc="upper center", bbox_to_anchor=(0.5, -0.14), fontsize=9, ncols=2)
+            axes.legend(title="method  AUC", loc="upper center", bbox_to_anchor=(0.5, -0.14), fontsize=9, ncols=columns)
         else:
             axes.text(0.5, 0.5, "no such joints", transform=axes.transAxes, ha="center", color=_GREY)
     panels[0].set_ylabel("joints within the distance, %\n(missed and left out: not within)")
@@ -106,11 +108,13 @@ def pck_over_distance(
     return _png(figure)
 
 
-def grouped_bars(heights: Mapping[str, Sequence[float]], groups: Sequence[str], label: str, title: str) -> bytes:
+def grouped_bars(
+    heights: Mapping[str, Sequence[float]], groups: Sequence[str], label: str, title: str, digits: int = 1
+) -> bytes:
     """Groups side by side, one bar per method in each, with its number."""
     figure = _figure(12, 5.4, title)
     axes = figure.subplots()
-    _bars(axes, {k: list(v) for k, v in heights.items()}, label_bars=True, digits=1)
+    _bars(axes, {k: list(v) for k, v in heights.items()}, label_bars=True, digits=digits)
     axes.set_xticks(range(len(groups)), [g.replace(", ", ",\n") for g in groups], fontsize=10)
     axes.set_ylabel(label)
     axes.legend(loc="lower left", bbox_to_anchor=(0, 1.0), ncols=4, fontsize=9, frameon=False)

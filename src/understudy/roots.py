@@ -46,10 +46,12 @@ _PLACES = np.array(
 )  # fmt: skip
 _AGREE = 0.22  # metres: depths of one torso lie within
 _LIMBS = np.array([i for i in range(N_JOINTS) if i not in TORSO])
-_WEIGHTS = np.concatenate([np.ones(len(_PLACES)), [3.0], np.full(len(_LIMBS), 0.15)])  # of trunk, component, limbs
-_SIZE_SIGMA = 0.35  # of the log of depth over the depth that the apparent size asks for
-_LEAST_CREDIBLE = 0.08
-_LEAST_CREDIBLE_LIMBS = 0.75  # without any depth on the trunk: limbs are thin, and what is behind them is near
+# Votes: of the places on the trunk, of the depth component, of the limbs (thin: what is behind them is near), of size.
+_WEIGHTS = np.concatenate([np.ones(len(_PLACES)), [3.0], np.full(len(_LIMBS), 0.15), [0.4]])
+_SIZE_SIGMA_NEAR, _SIZE_SIGMA_FAR = 0.45, 0.2  # of the log of depth over the depth that the apparent size asks for
+_RIVAL = 0.2  # share of the winner's votes that makes a second place worth a look
+_MOST = 3
+_APART = 0.45  # metres between two places that are worth a look
 _INSIDE = 0.08  # metres from the trunk's surface to its middle
 _NECK_TO_CENTER = 0.25  # metres from the neck down to the middle of the trunk
 _HIPS = rows("right_hip", "left_hip")
@@ -65,33 +67,30 @@ class Root:
     """`depth`, or `size`: no depth was near the person that its apparent size allows"""
 
 
-def find_root(person: Keypoints2D, depth: RegisteredDepth, camera: Camera, min_score: float = 0.2) -> Root | None:
-    """None only for a person without any 2D keypoint (through which the camera has a ray).
+def find_roots(person: Keypoints2D, depth: RegisteredDepth, camera: Camera, min_score: float = 0.2) -> list[Root]:
+    """Where the person may be, the likeliest place first; nearly always one. Empty only without usable 2D keypoints.
 
     min_score: keypoints with a lower score are not used, unless there are no others.
     """
-    found = person.found & np.isfinite(camera.normalized(person.uv)).all(1)
-    usable = found & (person.score >= min_score)
+    usable = person.found & (person.score >= min_score)
     if usable.sum() < 2:
-        usable = found
+        usable = person.found
     if not usable.any():
-        return None
+        return []
     uv = np.where(usable[:, None], person.uv, np.nan)
     ray = camera.normalized(uv)
     sized = _depth_of_size(ray)
     trunk = np.median(nearest_depths(depth, camera, _on_trunk(uv)), axis=1)
     limbs = np.median(nearest_depths(depth, camera, uv[_LIMBS]), axis=1)
-    votes = np.concatenate([trunk, [person.torso_z or np.nan], limbs])
-    z, evidence = _elected(votes, sized), "depth"
-    if z is None:
-        z, evidence = sized, "size"
-    if z is None:  # one or two keypoints, and nothing to measure them by: any depth is better than none
+    places = _elected(np.concatenate([trunk, [person.torso_z or np.nan], limbs, [sized or np.nan]]), sized)
+    if not places:  # one or two keypoints, and nothing to measure them by: any depth is better than none
         values = nearest_depths(depth, camera, uv, k=1, radius=0.1)
-        near = values[np.isfinite(values)]
-        z, evidence = (float(np.median(near)), "depth") if len(near) else (_depth_of_head(ray), "size")
-    center = _center(ray, z)
-    point = np.append(center * z, z)
-    return Root(point * (1 + _INSIDE / np.linalg.norm(point)), evidence)
+        places = [(float(np.nanmedian(values)), "depth")] if np.isfinite(values).any() else []
+    return [Root(_behind_surface(np.append(_center(ray, z) * z, z)), evidence) for z, evidence in places]
+
+
+def _behind_surface(point: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+    return point * (1 + _INSIDE / np.linalg.norm(point))
 
 
 def _on_trunk(uv: Float[np.ndarray, "18 2"]) -> Float[np.ndarray, "9 2"]:
@@ -120,21 +119,30 @@ def _depth_of_head(ray: Float[np.ndarray, "18 2"]) -> float:
     return float(np.clip(1 / ratio.max(), *_DISTANCES)) if len(ratio) else _USUAL
 
 
-def _elected(values: np.ndarray, sized: float | None) -> float | None:
-    """The depth on which most of `values` agree; None when nothing that the apparent size allows was measured.
+def _elected(values: np.ndarray, sized: float | None) -> list[tuple[float, str]]:
+    """The depths on which most of `values` agree, and the evidence for each; the best first.
 
-    Each value votes for those near it. What makes the person a dwarf or a giant counts less, the more so the further
-    it goes, so that a few depths of an occluder do not outvote the rest; but many that agree win over a wrong size.
+    Each value votes for those near it. What would make the person a dwarf or a giant counts less, so that a few depths
+    of an occluder or of the background do not outvote the rest, but many that agree win over a wrong size. A bone may
+    look too short because it points along the view; it has no such excuse for looking too long.
     """
     valid = np.isfinite(values)
-    if not valid.any():
-        return None
-    values, weights = values[valid], _WEIGHTS[valid]
-    credible = np.ones(len(values)) if sized is None else np.exp(-0.5 * (np.log(values / sized) / _SIZE_SIGMA) ** 2)
-    near = np.abs(values[:, None] - values) < _AGREE
-    best = np.argmax((near @ weights) * credible)
-    least = _LEAST_CREDIBLE if valid[: len(_PLACES) + 1].any() else _LEAST_CREDIBLE_LIMBS
-    return float(np.median(values[near[best]])) if credible[best] > least else None
+    chosen, weights = values[valid], _WEIGHTS[valid]
+    measured = np.arange(len(values))[valid] < len(values) - 1
+    credible = np.ones(len(chosen))
+    if sized is not None:
+        off = np.log(chosen / sized)
+        credible = np.exp(-0.5 * (off / np.where(off < 0, _SIZE_SIGMA_NEAR, _SIZE_SIGMA_FAR)) ** 2)
+    near = np.abs(chosen[:, None] - chosen) < _AGREE
+    votes = (near @ weights) * credible
+    places: list[tuple[float, str]] = []
+    least = _RIVAL * votes.max(initial=0)
+    while len(places) < _MOST and len(votes) and votes.max() > least:
+        best = int(np.argmax(votes))
+        voters = near[best] & measured
+        places.append((float(np.median(chosen[voters])), "depth") if voters.any() else (float(chosen[best]), "size"))
+        votes = np.where(np.abs(chosen - places[-1][0]) < _APART, -1.0, votes)
+    return places
 
 
 def _center(ray: Float[np.ndarray, "18 2"], z: float) -> Float[np.ndarray, "2"]:

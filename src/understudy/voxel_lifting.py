@@ -1,4 +1,8 @@
-"""The voxel method: root, person's view, network, assembly. `VoxelLifter` names the stages in order."""
+"""The voxel method: roots, person's view, network, assembly. `VoxelLifter` names the stages in order.
+
+Where several places compete for a person (an occluder, the background), the network looks at each, and the one in which
+it believes most wins.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +14,7 @@ import numpy as np
 from understudy import voxels
 from understudy.assembly import ASSEMBLIES, Rows
 from understudy.errors import UnderstudyError, one_of
-from understudy.roots import Root, find_root
+from understudy.roots import Root, find_roots
 from understudy.types import INFERRED, OBSERVED, Keypoints2D, Person, RegisteredFrame
 from understudy.voxelposenet.predictor import Prediction, Predictor, keypoint_input
 from understudy.voxels import PersonView
@@ -30,27 +34,34 @@ class VoxelLifter:
     def lift(self, frame: RegisteredFrame, people: Sequence[Keypoints2D]) -> list[Person]:
         if not people:
             return []
-        roots = [find_root(person, frame.depth, frame.camera, self.min_score) for person in people]
-        lifted = iter(self._lift(frame, [(p, r) for p, r in zip(people, roots, strict=True) if r is not None]))
+        roots = [find_roots(person, frame.depth, frame.camera, self.min_score) for person in people]
+        each = [(person, root) for person, several in zip(people, roots, strict=True) for root in several]
+        lifted = iter(self._lift(frame, each))
+        candidates = [[next(lifted) for _ in r] for r in roots]
         return [
-            Person.failure(person, "no usable 2D keypoint") if root is None else next(lifted)
-            for person, root in zip(people, roots, strict=True)
+            max(several, key=_credibility) if several else Person.failure(person, "no usable 2D keypoint")
+            for person, several in zip(people, candidates, strict=True)
         ]
 
-    def _lift(self, frame: RegisteredFrame, rooted: Sequence[tuple[Keypoints2D, Root]]) -> list[Person]:
-        """Those who have a root, in their order."""
-        if not rooted:
+    def _lift(self, frame: RegisteredFrame, each: Sequence[tuple[Keypoints2D, Root]]) -> list[Person]:
+        """Every pair of a person and a place."""
+        if not each:
             return []
-        views = [PersonView.towards(root.point) for _, root in rooted]
+        views = [PersonView.towards(root.point) for _, root in each]
         cloud = voxels.cloud(frame.depth)
         depth = np.stack([view.depth_grid(cloud) for view in views])
         rows = np.stack(
-            [keypoint_input(v, frame.camera, p, self.min_score) for v, (p, _) in zip(views, rooted, strict=True)]
+            [keypoint_input(v, frame.camera, p, self.min_score) for v, (p, _) in zip(views, each, strict=True)]
         )
         said = self.predictor(views, depth, rows)
-        return [self._person(p, *each) for (p, _), *each in zip(rooted, views, rows, said, strict=True)]
+        return [self._person(p, *with_it) for (p, _), *with_it in zip(each, views, rows, said, strict=True)]
 
     def _person(self, seen: Keypoints2D, view: PersonView, rows: Rows, said: Prediction) -> Person:
         joints = view.to_cam(self._assemble(said, rows, view))
         source = np.where((said.seen > 0.5) & (rows[:, 2] > 0), OBSERVED, INFERRED)
         return Person(seen, joints, said.confidence, said.sigma, tuple(source.tolist()))
+
+
+def _credibility(person: Person) -> float:
+    """Which of several places of one person the network believes in."""
+    return float(person.confidence.mean())

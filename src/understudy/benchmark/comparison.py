@@ -1,7 +1,7 @@
 """Every method on the same detections of the same people, with what was lifted kept on disk.
 
-`lift_group` runs; `scores` counts; `comparison_report` writes. What is in the cache is not run again: a file is known by
-the recording, the 2D keypoints, and the weights and code of the method.
+`lift_group` runs; `scores` counts; `comparison_report` writes. What is in the cache is not run again: a file is known
+by the recording, the 2D keypoints, and the weights and code of the method.
 """
 
 from __future__ import annotations
@@ -117,9 +117,7 @@ def lift_group(
         subjects.append(some)
         for key, result in results.items():
             lifted[key].append(result)
-    return Group(
-        title, slug, tuple(names), Subjects.pooled(subjects), {k: Lifted.pooled(v) for k, v in lifted.items()}
-    )
+    return Group(title, slug, tuple(names), Subjects.pooled(subjects), {k: Lifted.pooled(v) for k, v in lifted.items()})
 
 
 def lift_recording(
@@ -162,7 +160,10 @@ def _lift(
     n = len(subjects.frame)
     out = {
         (quality, method.name): Lifted(
-            np.full((n, N_JOINTS, 3), np.nan), *np.full((2, n, N_JOINTS), np.nan), np.ones(n, bool)
+            np.full((n, N_JOINTS, 3), np.nan),
+            np.full((n, N_JOINTS), np.nan),
+            np.full((n, N_JOINTS), np.nan),
+            np.ones(n, bool),
         )
         for quality, method in jobs
     }
@@ -201,6 +202,6 @@ def _load(path: Path, kind: type[Arrays]) -> Arrays | None:
     """None where there is no such file, or one that was damaged."""
     try:
         with np.load(path) as data:
-            return kind(*(data[f.name] for f in fields(kind)))
+            return kind(*[data[f.name] for f in fields(kind)])
     except (OSError, ValueError, KeyError, EOFError):
         return None

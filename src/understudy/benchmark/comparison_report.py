@@ -26,26 +26,30 @@ PLOTS: Final = ("pck", "distance", "joints", "quality", "calibration")
 """Plots of each group: GROUP-NAME.png"""
 
 _DEFINITIONS = f"""\
-- People: true people with a joint in the image whom the 2D detector found. Detections are matched to them in 2D, before
-  any method runs (least median distance of the keypoints, at most 0.3 of the person's size in the image); **all methods get the same
-  detections**. Undetected people and detections of nobody are counted above the tables, and are nobody's fault here.
-- Joints: those inside the image, visible or occluded. EPE: mean Euclidean error, cm, of the joints that a method gave.
-  PCK@10: share within 10 cm. AUC: area under the PCK curve from 0 to 20 cm, over its width (0 to 1).
-- **A joint that a method does not give counts as missed in PCK and AUC, and is left out of the EPE.** `common EPE` is over
-  the joints that all methods of the table give, so that it compares like with like. `given`: share of joints that a method gives.
-- hard: people who are not frontal (chest more than 45 degrees from the way to the camera, from the true shoulders and hips) or have
-  something in front of them: {COVERED_JOINTS} or more joints in view that the truth calls occluded, where the measured surface before the
-  joint is more than 25 cm from all of the person's own bones.
+- People: true people with a joint in the image whom the 2D detector found. Detections are matched to them in 2D,
+  before any method runs (least median distance of the keypoints, at most 0.3 of the person's size in the image);
+  **all methods get the same detections**. Undetected people and detections of nobody are counted above the tables,
+  and are nobody's fault here.
+- Joints: those inside the image, visible or occluded. EPE: mean Euclidean error, cm, of the joints that a method
+  gave. PCK@10: share within 10 cm. AUC: area under the PCK curve from 0 to 20 cm, over its width (0 to 1).
+- **A joint that a method does not give counts as missed in PCK and AUC, and is left out of the EPE.** `common EPE` is
+  over the joints that all methods of the table give, so that it compares like with like. `given`: share of joints
+  that a method gives.
+- hard: people who are not frontal (chest more than 45 degrees from the way to the camera, from the true shoulders and
+  hips) or have something in front of them: {COVERED_JOINTS} or more joints in view that the truth calls occluded,
+  where the measured surface before the joint is more than 25 cm from all of the person's own bones.
 - swaps: share of left-right pairs whose joints are both nearer to the other side's truth than to their own.
 - failed: people for whom a method gives no joint at all.
-- ECE: mean over 10 bins of the confidence, weighted by joints, of |confidence - share within 10 cm|. Within sigma: share of errors of at most
-  `sigma_m`, which claims 68 %. `paper*` has neither; its score volume's peak stands in for confidence.
-- naive: 2D keypoint at the median of the 3 nearest depths. naive-offset: that, moved along the ray by a constant per kind of joint,
-  fitted on the simulator. mlp: residual MLP on all 2D keypoints and the depths under them, trained on the same simulated people as
-  the network. `{NO_ASSEMBLY}`: the network's joints. `{PAPER_ASSEMBLY}`: where the 2D score exceeds the confidence, the 2D
-  keypoint at the network's depth. `{UPPER}...`: the network given the projected true joints (score 1) in place of detections: the upper bound.
-- Degraded 2D: "errors x 2" doubles each detected keypoint's distance from the true one; "20 % dropped" loses each found
-  keypoint with a probability of 20 %."""
+- ECE: mean over 10 bins of the confidence, weighted by joints, of |confidence - share within 10 cm|. Within sigma:
+  share of errors of at most `sigma_m`, which claims 68 %. `paper*` has neither; its score volume's peak stands in for
+  confidence.
+- naive: 2D keypoint at the median of the 3 nearest depths. naive-offset: that, moved along the ray by a constant per
+  kind of joint, fitted on the simulator. mlp: residual MLP on all 2D keypoints and the depths under them, trained on
+  the same simulated people as the network. `{NO_ASSEMBLY}`: the network's joints. `{PAPER_ASSEMBLY}`: where the 2D
+  score exceeds the confidence, the 2D keypoint at the network's depth. `{UPPER}...`: the network given the projected
+  true joints (score 1) in place of detections: the upper bound.
+- Degraded 2D: "errors x 2" doubles each detected keypoint's distance from the true one; "20 % dropped" loses each
+  found keypoint with a probability of 20 %."""
 
 
 @dataclass(frozen=True)
@@ -80,20 +84,24 @@ def write_report(out: Path, groups: Sequence[Group], trainings: Trainings, notes
 
 
 _INTRODUCTION = (
-    "Written by `benchmarks/paper_tables.py` (the command is at the end); made anew, not edited. The tables and figures have the "
-    "shape of those of the paper (Zimmermann et al., ICRA 2018). Errors in cm; definitions are at the end."
+    "Written by `benchmarks/paper_tables.py` (the command is at the end); made anew, not edited. The tables and "
+    "figures have the shape of those of the paper (Zimmermann et al., ICRA 2018). Errors in cm; definitions are at the "
+    "end."
 )
 
 
 def main_keys(group: Group) -> dict[str, Key]:
-    """Rows of the main table: all methods on the detections, then the upper bounds."""
-    keys: dict[str, Key] = {m: (DETECTIONS, m) for m in group.methods}
-    return keys | {f"{UPPER}{q}": (q, OURS) for q in UPPER_BOUND if (q, OURS) in group.lifted}
+    """Rows of the main table: methods on the detections, the network on true 2D; last, what `few` leaves out."""
+    variants = (NO_ASSEMBLY, PAPER_ASSEMBLY)
+    keys: dict[str, Key] = {m: (DETECTIONS, m) for m in group.methods if m not in variants}
+    upper: dict[str, Key] = {f"{UPPER}{q}": (q, OURS) for q in UPPER_BOUND if (q, OURS) in group.lifted}
+    return keys | upper | {m: (DETECTIONS, m) for m in variants if m in group.methods}
 
 
 def few(group: Group) -> dict[str, Key]:
-    """The methods of crowded plots: of the network's variants only ours."""
-    return {n: k for n, k in main_keys(group).items() if n not in (NO_ASSEMBLY, PAPER_ASSEMBLY, f"{UPPER}{UPPER_BOUND[1]}")}
+    """The methods of crowded plots: of the network's variants only ours (the first rows, so colours stay)."""
+    left_out = (NO_ASSEMBLY, PAPER_ASSEMBLY, f"{UPPER}{UPPER_BOUND[1]}")
+    return {n: k for n, k in main_keys(group).items() if n not in left_out}
 
 
 def _evaluations(group: Group, keys: Mapping[str, Key]) -> dict[str, Evaluation]:
@@ -107,8 +115,8 @@ def draw(group: Group) -> dict[str, bytes]:
     shares = {name: pck_over_distance(group.subjects, one)[0] for name, one in lifted.items()}
     counts = pck_over_distance(group.subjects, next(iter(lifted.values())))[1]
     qualities = [q for q in QUALITIES if any(q == k[0] for k in group.lifted)]
-    epe = {
-        m: [100 * _joints(group, (q, m)).epe_m if (q, m) in group.lifted else np.nan for q in qualities]
+    auc = {
+        m: [_joints(group, (q, m)).auc if (q, m) in group.lifted else np.nan for q in qualities]
         for m in DEGRADED
         if m in group.methods
     }
@@ -117,7 +125,7 @@ def draw(group: Group) -> dict[str, bytes]:
         "distance": plots.pck_over_distance(shares, counts, DISTANCES_M, group.title),
         "joints": plots.joint_bars(_evaluations(group, some), group.title),
         "quality": plots.grouped_bars(
-            epe, qualities, "EPE of given joints in view, cm", f"Quality of the 2D keypoints: {group.title}"
+            auc, qualities, "AUC (0-20 cm), joints in view", f"Quality of the 2D keypoints: {group.title}", digits=2
         ),
         "calibration": plots.calibration(_evaluations(group, some), group.title),
     }
@@ -145,16 +153,13 @@ def main_table(rows: Mapping[str, Score]) -> str:
         "method", "EPE cm", "hard cm", "visible cm", "occluded cm", "common EPE cm", "given %", "PCK@10 %", "AUC",
         "AUC hard", "AUC occluded", "swaps %", "failed",
     ]  # fmt: skip
-    return markdown_lines(
-        heads,
-        [
-            [
-                name, _cm(s.epe_m), _cm(s.hard_m), _cm(s.visible_m), _cm(s.occluded_m), _cm(s.common_m), _percent(s.given),
-                _percent(s.pck), number(s.auc, 3), number(s.auc_hard, 3), number(s.auc_occluded, 3), _percent(s.swapped), str(s.failed),
-            ]
-            for name, s in rows.items()
-        ],
-    )  # fmt: skip
+    cells = []
+    for name, s in rows.items():
+        cm = [s.epe_m, s.hard_m, s.visible_m, s.occluded_m, s.common_m]
+        auc = [s.auc, s.auc_hard, s.auc_occluded]
+        numbers = [*map(_cm, cm), _percent(s.given), _percent(s.pck), *(number(a, 3) for a in auc), _percent(s.swapped)]
+        cells.append([name, *numbers, str(s.failed)])
+    return markdown_lines(heads, cells)
 
 
 def _group(group: Group) -> Iterator[str]:
@@ -163,9 +168,9 @@ def _group(group: Group) -> Iterator[str]:
     occluded = int((s.counted & s.occluded).sum())
     yield f"## {group.title}"
     yield (
-        f"{len(s.frame)} people in {frames} frames of {', '.join(group.names)}: {int(s.counted.sum())} joints, {occluded} of "
-        f"them occluded; {int(s.hard.sum())} people are hard. Not detected: {int(s.undetected.sum())} people; detections of "
-        f"nobody: {int(s.unmatched.sum())}."
+        f"{len(s.frame)} people in {frames} frames of {', '.join(group.names)}: {int(s.counted.sum())} joints, "
+        f"{occluded} of them occluded; {int(s.hard.sum())} people are hard. Not detected: {int(s.undetected.sum())} "
+        f"people; detections of nobody: {int(s.unmatched.sum())}."
     )
     yield main_table(scores(group, main_keys(group)))
     yield _image(group, "pck", "PCK curves")
@@ -261,5 +266,3 @@ def _trainings(groups: Sequence[Group], trainings: Trainings) -> Iterator[str]:
         yield markdown_lines(["sensor", "trained without it", f"{OURS} (trained with it)"], rows)
     if not (trainings.bodies or trainings.without):
         yield "No other trainings were given (see below)."
-
-

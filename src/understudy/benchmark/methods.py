@@ -150,12 +150,11 @@ _REGISTRY: Final = MappingProxyType[str, Callable[[str, Weights], Method]](
         "mlp": _mlp,
         "paper-fast": _Paper("paper_fast", "--paper-fast"),
         "paper": _Paper("paper", "--paper"),
+        OURS: _Network("uncertainty"),
         NO_ASSEMBLY: _Network("network"),
         PAPER_ASSEMBLY: _Network("paper"),
-        OURS: _Network("uncertainty"),
     }
 )
 NAMES: Final = tuple(_REGISTRY)
-NETWORK: Final = (NO_ASSEMBLY, PAPER_ASSEMBLY, OURS)
+NETWORK: Final = (OURS, NO_ASSEMBLY, PAPER_ASSEMBLY)
 """Variants of the default network."""
-

@@ -100,7 +100,7 @@ def scores(group: Group, keys: Mapping[str, tuple[str, str]]) -> dict[str, Score
 def pck_over_distance(
     subjects: Subjects, lifted: Lifted, edges: Sequence[float] = DISTANCES_M, within_m: float = 0.10
 ) -> tuple[Float[np.ndarray, " k"], Int[np.ndarray, " k"]]:
-    """Per bin of the person's distance (metres): share of counted joints within 10 cm (NaN for few), and their number."""
+    """Per bin of the person's distance (metres): share of counted joints within 10 cm (NaN for few), their number."""
     bin_of = np.digitize(subjects.distance, edges) - 1
     right = np.nan_to_num(errors(subjects, lifted), nan=np.inf) <= within_m + 1e-9
     shares, counts = [], []

@@ -33,7 +33,9 @@ COVERED_JOINTS: Final = 3
 """so many joints behind something else put an object in front of a person"""
 _BODY_M = 0.25  # metres from the nearest bone: what is farther away is not the person's own body
 _BEHIND_M = 0.05  # metres: a joint lies behind a surface
-_SEGMENTS = np.array([*BONES, (JOINT["right_shoulder"], JOINT["left_hip"]), (JOINT["left_shoulder"], JOINT["right_hip"])])
+_SEGMENTS = np.array(
+    [*BONES, (JOINT["right_shoulder"], JOINT["left_hip"]), (JOINT["left_shoulder"], JOINT["right_hip"])]
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +117,7 @@ def read_subjects(recording: Recording, name: str) -> Subjects:
         for i, (kind, shape) in enumerate(zip(kinds, shapes, strict=True))
     ]
     number = np.full(len(rows), number_of(name), np.int64)
-    return Subjects(number, *columns, np.array([undetected]), np.array([unmatched]))
+    return Subjects(*[number, *columns, np.array([undetected]), np.array([unmatched])])
 
 
 def _ignore(index: int, error: FrameError) -> None:
@@ -151,7 +153,9 @@ def is_frontal(keypoints: Float[np.ndarray, "18 3"]) -> bool:
     return bool(-(facing @ k["neck"]) >= FRONTAL_COSINE * length) if np.isfinite(length) and length > 0 else False
 
 
-def _behind_others(frame: RegisteredFrame, person: TruthPerson, uv: Float[np.ndarray, "18 2"]) -> Bool[np.ndarray, "18"]:
+def _behind_others(
+    frame: RegisteredFrame, person: TruthPerson, uv: Float[np.ndarray, "18 2"]
+) -> Bool[np.ndarray, "18"]:
     """Joints behind a measured surface that is not part of the person."""
     inside = frame.camera.contains(uv)
     z = nearest_depths(frame.depth, frame.camera, np.where(inside[:, None], uv, np.nan), k=1)[:, 0].astype(np.float64)
@@ -160,12 +164,16 @@ def _behind_others(frame: RegisteredFrame, person: TruthPerson, uv: Float[np.nda
     return np.asarray(nearer & (distance_to_bones(surface, person.keypoints) > _BODY_M))
 
 
-def surface_points(camera: Camera, uv: Float[np.ndarray, "n 2"], z: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
+def surface_points(
+    camera: Camera, uv: Float[np.ndarray, "n 2"], z: Float[np.ndarray, " n"]
+) -> Float[np.ndarray, "n 3"]:
     """Metres; NaN where there is no depth."""
     return camera.unproject(np.where(np.isfinite(uv), uv, 0.0), z)
 
 
-def distance_to_bones(points: Float[np.ndarray, "n 3"], keypoints: Float[np.ndarray, "18 3"]) -> Float[np.ndarray, " n"]:
+def distance_to_bones(
+    points: Float[np.ndarray, "n 3"], keypoints: Float[np.ndarray, "18 3"]
+) -> Float[np.ndarray, " n"]:
     """Metres from each point to the nearest bone; NaN for a point that is NaN or a person without any bone."""
     a, b = keypoints[_SEGMENTS[:, 0]], keypoints[_SEGMENTS[:, 1]]
     known = np.isfinite(a).all(1) & np.isfinite(b).all(1)

@@ -76,9 +76,9 @@ def _front(batch: Batch, i: int) -> UInt8[np.ndarray, "t t 3"]:
     image = cv2.cvtColor(cv2.resize(bgr, (_TILE, _TILE), interpolation=cv2.INTER_NEAREST), cv2.COLOR_BGR2RGB)
     canvas = Canvas(np.ascontiguousarray(image))
     _skeleton(canvas, _pixel(batch.joints[i, :, :2].numpy()), batch.occluded[i].numpy())
-    for u, v, score in batch.keypoints[i].numpy():
+    for u, v, score in batch.keypoints[i].tolist():
         if score > 0:
-            canvas.outlined_cross(_pixel(np.array([u, v])), 2.0 + 2.0 * float(score), _DETECTED)
+            canvas.outlined_cross(_pixel(np.array([u, v])), 1.5 + 1.5 * score, _DETECTED)
     return canvas.image
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -31,6 +31,7 @@ class Estimate(NamedTuple):
     confidence: Float[Tensor, "b 18"]
 
 
+@runtime_checkable
 class Kind(Protocol):
     """One network, as training sees it."""
 

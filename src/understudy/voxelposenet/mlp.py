@@ -12,7 +12,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -37,6 +37,9 @@ _POOL = 200_000  # people that are kept
 
 class Mlp(nn.Module):
     """Residual blocks of two layers; corrects the naive estimate, and judges itself (log sigma, logit of 'within')."""
+
+    mean: Tensor
+    std: Tensor
 
     def __init__(self, hidden: int = 512, blocks: int = 2):
         super().__init__()
@@ -86,6 +89,7 @@ class Example:
         return cls(*(torch.cat(column) for column in zip(*(vars(p).values() for p in parts), strict=True)))
 
 
+@runtime_checkable
 class BatchSource(Protocol):
     """Batch by number."""
 
@@ -116,7 +120,7 @@ def train_mlp(
     batches: BatchSource | None = None,
     progress: bool = False,
 ) -> Mlp:
-    """Trains and writes `out` (safetensors). Give `minutes` or `steps`; the same `steps` and seed give the same weights.
+    """Trains and writes `out` (safetensors). Give `minutes`, or `steps`: the same ones give the same weights.
 
     New people are simulated all the time; each round of steps draws from all people so far, mirrored ones too.
     batches: in place of the simulated ones that `data` describes.
@@ -145,7 +149,8 @@ def train_mlp(
             group["lr"] = learning_rate * (0.01 + 0.99 * 0.5 * (1 + np.cos(np.pi * done)))
         for _ in range(_ROUND):
             some = everyone.rows(torch.randint(len(everyone.joints), (_BATCH,), generator=generator))
-            value = mlp_loss(*net(some.features, some.naive), some)
+            joints, judged = net(some.features, some.naive)
+            value = mlp_loss(joints, judged, some)
             optimizer.zero_grad()
             value.backward()
             optimizer.step()

@@ -6,14 +6,11 @@ import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from typing import Any, Final
 
 from understudy.errors import UnderstudyError, one_of
 from understudy.voxelposenet.data import DataConfig
 from understudy.voxelposenet.net import NetConfig
-
-if TYPE_CHECKING:
-    from _typeshed import DataclassInstance
 
 NETWORKS: Final = ("default", "paper", "paper-fast")
 SCHEDULES: Final = ("cosine", "steps")
@@ -117,24 +114,28 @@ PRESETS: Final = MappingProxyType(
 FREE: Final = ("steps", "workers", "device", "checkpoint_every", "log_every", "validate_every", "plots")
 """What may change when a run goes on."""
 
-T = TypeVar("T", bound="DataclassInstance")
 
-
-def from_json(data: Mapping[str, Any], base: T, where: str) -> T:
-    """`base`, a dataclass of this file or within it, with the values of a JSON object in place of its own.
+def from_json(data: Mapping[str, Any], base: TrainConfig, where: str) -> TrainConfig:
+    """`base` with the values of a JSON object in place of its own.
 
     Raises UnderstudyError that begins with `where` and names the field.
     """
+    config: TrainConfig = _filled(data, base, where)
+    return config
+
+
+def _filled(data: Mapping[str, Any], base: Any, where: str) -> Any:
+    """`from_json` for any dataclass."""
     known = {f.name for f in fields(base)}
     changed: dict[str, Any] = {}
     for name, value in data.items():
         if name not in known:
             raise UnderstudyError(f"{where}: there is no {name!r}; must be {one_of(sorted(known))}")
         old = getattr(base, name)
-        if is_dataclass(old) and not isinstance(old, type):
+        if is_dataclass(old):
             if not isinstance(value, Mapping):
                 raise UnderstudyError(f"{where}: {name!r} must be an object, got {value!r}")
-            changed[name] = from_json(value, old, f"{where}: {name}")
+            changed[name] = _filled(value, old, f"{where}: {name}")
         else:
             changed[name] = _value(value, old, f"{where}: {name!r}")
     try:
