@@ -28,6 +28,7 @@ def main() -> None:
     samples = Samples(bank, SampleConfig(), 0)
     speed = measure(samples, BATCH, batches=10)
     rows = [["samples/s", f"{speed.per_s:.0f}", ""]]
+    rows += [["samples per second of processor time", f"{speed.per_cpu_s:.0f}", ""]]
     rows += [[f"  {part}, ms a sample", f"{ms:.2f}", f"{ms * speed.per_s / 10:.0f} %"] for part, ms in speed.ms.items()]
 
     boxes, origin, rays = scene()

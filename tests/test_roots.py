@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from understudy.camera import Camera
-from understudy.roots import find_root
-from understudy.skeleton import FACE, JOINT, JOINTS, N_JOINTS, rows
+from understudy.roots import Root, find_roots
+from understudy.skeleton import FACE, JOINTS, N_JOINTS, rows
 from understudy.types import Keypoints2D, RegisteredDepth
 
 CAMERA = Camera(960, 540, np.array([[540.7, 0, 479.5], [0, 540.7, 269.5], [0, 0, 1.0]]))
@@ -47,16 +47,21 @@ def body(x: float = 0.0, z: float = 3.0) -> tuple[float, float, float, float, fl
     return (x - 0.3, x + 0.3, -0.7, 1.1, z)
 
 
+def find(who: Keypoints2D, depth: RegisteredDepth) -> Root:
+    """The likeliest place."""
+    return find_roots(who, depth, CAMERA)[0]
+
+
 def found_at(depth: RegisteredDepth, who: Keypoints2D, x: float = 0.0, z: float = 3.0, off: float = 0.2) -> None:
-    root = find_root(who, depth, CAMERA)
-    assert root is not None and np.isfinite(root.point).all()
+    root = find(who, depth)
     assert abs(root.point[2] - z) < off, root
     assert abs(root.point[0] - x) < 0.25 and abs(root.point[1] + 0.1) < 0.45, root
 
 
 def test_in_the_open():
     found_at(image(body()), person(), off=0.15)
-    assert find_root(person(), image(body()), CAMERA).evidence == "depth"
+    alone = find_roots(person(), image(body()), CAMERA)
+    assert [root.evidence for root in alone] == ["depth"]  # no other place is worth a look
 
 
 def test_neck_behind_an_occluder():
@@ -70,7 +75,8 @@ def test_shoulders_behind_an_occluder():
 
 def test_trunk_behind_a_table_that_leaves_the_head_and_the_legs():
     """Everything measured on the trunk is the table's."""
-    found_at(image(body(), (-0.5, 0.5, -0.25, 0.12, 1.4)), person(), off=0.35)
+    places = find_roots(person(), image(body(), (-0.5, 0.5, -0.25, 0.12, 1.4)), CAMERA)
+    assert min(abs(root.point[2] - 3) for root in places) < 0.35  # among those that the network looks at
 
 
 def test_no_depth_at_the_neck():
@@ -86,23 +92,23 @@ def test_no_depth_at_the_neck():
     ],
 )  # fmt: skip
 def test_parts_of_people(only):
-    root = find_root(person(only=only), image(body()), CAMERA)
+    root = find(person(only=only), image(body()))
     assert abs(root.point[2] - 3) < 0.2 and abs(root.point[0]) < 0.4, root
 
 
 def test_no_depth_at_all_leaves_the_apparent_size():
     nothing = RegisteredDepth(np.zeros((540, 960), np.float32), CAMERA)
     for z in (2.0, 3.0, 4.5):
-        root = find_root(person(z=z), nothing, CAMERA)
+        root = find(person(z=z), nothing)
         assert root.evidence == "size"
         assert abs(root.point[2] / z - 1) < 0.25
-    head = find_root(person(only=tuple(JOINTS[i] for i in FACE)), nothing, CAMERA)
+    head = find(person(only=tuple(JOINTS[i] for i in FACE)), nothing)
     assert head.evidence == "size" and abs(head.point[2] - 3) < 0.6
 
 
 def test_only_the_wall_behind_is_measured():
     """A person of whom the sensor sees nothing (black clothes) does not stand in the wall."""
-    root = find_root(person(z=2.0), image(wall=7.0), CAMERA)
+    root = find(person(z=2.0), image(wall=7.0))
     assert abs(root.point[2] - 2) < 0.5 and root.evidence == "size"
 
 
@@ -120,7 +126,7 @@ def test_one_person_half_behind_another():
 def test_low_scores_count_only_when_there_is_nothing_else():
     ghost = person(0.0, 3.0, ("left_hip",), 0.1)
     mixed = Keypoints2D.where(person().uv, np.where(rows_mask("left_hip"), 0.1, 0.9))
-    assert find_root(ghost, image(body()), CAMERA) is not None
+    assert find_roots(ghost, image(body()), CAMERA)
     found_at(image(body()), mixed)
 
 
@@ -145,11 +151,11 @@ def test_nobody_is_dropped(kept, score, depth, seed):
     }[depth]  # fmt: skip
     who = person(only=tuple(kept), score=score)
     who = Keypoints2D.where(who.uv + rng.normal(0, 30, (N_JOINTS, 2)), who.score)
-    root = find_root(who, RegisteredDepth(z.astype(np.float32), CAMERA), CAMERA)
-    assert root is not None and np.isfinite(root.point).all() and root.point[2] > 0.1
+    places = find_roots(who, RegisteredDepth(z.astype(np.float32), CAMERA), CAMERA)
+    assert 1 <= len(places) <= 3
+    assert all(np.isfinite(root.point).all() and root.point[2] > 0.1 for root in places)
 
 
 def test_nobody_there():
     empty = Keypoints2D.where(np.zeros((N_JOINTS, 2)), np.zeros(N_JOINTS))
-    assert find_root(empty, image(), CAMERA) is None
-    assert JOINT["neck"] == 1
+    assert find_roots(empty, image(), CAMERA) == []

@@ -17,13 +17,13 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 
-from understudy import voxels
+from understudy.assembly import of_network
 from understudy.errors import MissingExtraError, ModelFileError, UnderstudyError
 from understudy.lifting import NaiveLifter
-from understudy.roots import find_root
 from understudy.skeleton import FLIP, JOINTS, N_JOINTS
-from understudy.types import INFERRED, OBSERVED, Keypoints2D, Person, RegisteredFrame
-from understudy.voxelposenet.predictor import keypoint_input
+from understudy.types import Keypoints2D, Person, RegisteredFrame
+from understudy.voxel_lifting import VoxelLifter
+from understudy.voxelposenet.predictor import Prediction, Predictor
 from understudy.voxels import CELL, CELLS, EMPTY, HALF, PersonView
 
 if TYPE_CHECKING:
@@ -164,8 +164,8 @@ class MlpOutput:
     confidence: Float[np.ndarray, "n 18"]
 
 
-class MlpPredictor:
-    """The trained MLP (`voxelposenet.mlp.train_mlp`), by plain matrix products."""
+class MlpPredictor(Predictor):
+    """The trained MLP (`voxelposenet.mlp.train_mlp`), by plain matrix products, in the network's place."""
 
     def __init__(self, weights: Path):
         try:
@@ -183,7 +183,21 @@ class MlpPredictor:
         self.about: Final[dict[str, str]] = words
         self._blocks = int(words["blocks"])
 
-    def __call__(self, features: Float32[np.ndarray, "n f"], naive: Float32[np.ndarray, "n 18 3"]) -> MlpOutput:
+    def __call__(
+        self,
+        views: list[PersonView],
+        depth: Float32[np.ndarray, "n 2 64 64"],
+        keypoints: Float32[np.ndarray, "n 18 3"],
+    ) -> list[Prediction]:
+        if not views:
+            return []
+        out = self.forward(*mlp_input(depth, keypoints, np.array([[v.root_z] for v in views], np.float32)))
+        spread = np.repeat(out.sigma[..., None] / np.sqrt(3), 3, -1)
+        found = (keypoints[..., 2] > 0).astype(np.float64)
+        columns = (out.joints, spread, out.sigma, out.confidence, found)
+        return [Prediction(*person) for person in zip(*columns, strict=True)]
+
+    def forward(self, features: Float32[np.ndarray, "n f"], naive: Float32[np.ndarray, "n 18 3"]) -> MlpOutput:
         """features, naive: `mlp_input`."""
         x = self._linear("first", (features - self._w["mean"]) / self._w["std"])
         for i in range(self._blocks):
@@ -197,38 +211,15 @@ class MlpPredictor:
         return np.asarray(x @ self._w[f"{name}.weight"].T + self._w[f"{name}.bias"])
 
 
-class MlpLifter:
-    """2D keypoints and the depths under them -> 3D joints, by the MLP: no geometry beyond the keypoints."""
+class MlpLifter(VoxelLifter):
+    """2D keypoints and the depths under them -> 3D joints, by the MLP. Roots and views are those of the network; no
+    assembly.
+    """
 
     def __init__(self, weights: Path, min_score: float = 0.2):
         self.min_score = min_score
         self.predictor = MlpPredictor(weights)
-
-    def lift(self, frame: RegisteredFrame, people: Sequence[Keypoints2D]) -> list[Person]:
-        roots = [find_root(p, frame.depth, frame.camera, self.min_score) for p in people]
-        views = [PersonView.towards(r.point) for r in roots if r is not None]
-        rooted = [p for p, r in zip(people, roots, strict=True) if r is not None]
-        said = iter(self._people(frame, rooted, views) if rooted else [])
-        return [
-            Person.failure(p, "none of its 2D keypoints is usable") if r is None else next(said)
-            for p, r in zip(people, roots, strict=True)
-        ]
-
-    def _people(self, frame: RegisteredFrame, people: list[Keypoints2D], views: list[PersonView]) -> list[Person]:
-        cloud = voxels.cloud(frame.depth)
-        depth = np.stack([v.depth_grid(cloud) for v in views])
-        rows = [keypoint_input(v, frame.camera, p, self.min_score) for v, p in zip(views, people, strict=True)]
-        root_z = np.array([[v.root_z] for v in views], np.float32)
-        out = self.predictor(*mlp_input(depth, np.stack(rows), root_z))
-        return [
-            Person(
-                seen, view.to_cam(joints), confidence, sigma,
-                tuple(np.where(seen.found, OBSERVED, INFERRED).tolist()),
-            )
-            for seen, view, joints, confidence, sigma in zip(
-                people, views, out.joints, out.confidence, out.sigma, strict=True
-            )
-        ]  # fmt: skip
+        self._assemble = of_network
 
 
 def mirrored(keypoints: Float[np.ndarray, "n 18 c"]) -> Float[np.ndarray, "n 18 c"]:

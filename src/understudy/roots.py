@@ -68,13 +68,14 @@ class Root:
 
 
 def find_roots(person: Keypoints2D, depth: RegisteredDepth, camera: Camera, min_score: float = 0.2) -> list[Root]:
-    """Where the person may be, the likeliest place first; nearly always one. Empty only without usable 2D keypoints.
+    """Where the person may be, the likeliest place first; nearly always one. Empty only without 2D keypoints.
 
     min_score: keypoints with a lower score are not used, unless there are no others.
     """
-    usable = person.found & (person.score >= min_score)
+    found = person.found & np.isfinite(camera.normalized(person.uv)).all(1)
+    usable = found & (person.score >= min_score)
     if usable.sum() < 2:
-        usable = person.found
+        usable = found
     if not usable.any():
         return []
     uv = np.where(usable[:, None], person.uv, np.nan)
@@ -85,8 +86,14 @@ def find_roots(person: Keypoints2D, depth: RegisteredDepth, camera: Camera, min_
     places = _elected(np.concatenate([trunk, [person.torso_z or np.nan], limbs, [sized or np.nan]]), sized)
     if not places:  # one or two keypoints, and nothing to measure them by: any depth is better than none
         values = nearest_depths(depth, camera, uv, k=1, radius=0.1)
-        places = [(float(np.nanmedian(values)), "depth")] if np.isfinite(values).any() else []
+        near = values[np.isfinite(values)]
+        places = [(float(np.median(near)), "depth") if len(near) else (_depth_of_head(ray), "size")]
     return [Root(_behind_surface(np.append(_center(ray, z) * z, z)), evidence) for z, evidence in places]
+
+
+def find_root(person: Keypoints2D, depth: RegisteredDepth, camera: Camera, min_score: float = 0.2) -> Root | None:
+    """The likeliest of `find_roots`; None when there is none."""
+    return next(iter(find_roots(person, depth, camera, min_score)), None)
 
 
 def _behind_surface(point: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:

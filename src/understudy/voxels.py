@@ -12,6 +12,7 @@ z = Z - root_z. Cells have an edge of `CELL` in these coordinates and begin at -
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Final
 
 import numpy as np
@@ -79,27 +80,41 @@ class PersonView:
         limited to +-LIMIT; `EMPTY` where nothing was measured. One value or a hundred in a column make no difference,
         so that coarse and fine sensors look alike.
         """
-        p = points @ self.R_view_cam.T.astype(points.dtype)
-        z = p[:, 2]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            cell = p[:, :2] * (self.root_z / CELL / z)[:, None] + CELLS // 2
-        inside = (z > _NEAREST_Z) & (cell >= 0).all(1) & (cell < CELLS).all(1)
-        column = cell[inside].astype(np.int32) @ np.array([1, CELLS], np.int32)
-        depth = (z[inside] - self.root_z).astype(np.float32)
-        grid = np.full((2, CELLS * CELLS), EMPTY, np.float32)
-        np.minimum.at(grid[0], column, depth.clip(-LIMIT, LIMIT))
+        x, y, z = self.R_view_cam.astype(points.dtype) @ points.T
+        scale = points.dtype.type(self.root_z / CELL)
+        edge = z * points.dtype.type(CELLS // 2)
+        x, y = x * scale, y * scale
+        inside = np.flatnonzero((z > _NEAREST_Z) & (np.abs(x) < edge) & (np.abs(y) < edge))
+        x, y, z = x[inside], y[inside], z[inside]
+        column = (y / z + CELLS // 2).astype(np.int32) * CELLS + (x / z + CELLS // 2).astype(np.int32)
+        depth = (z - self.root_z).astype(np.float32)
+        near = np.full(CELLS * CELLS, EMPTY, np.float32)
+        np.minimum.at(near, column, depth.clip(-LIMIT, LIMIT))
         within = np.abs(depth) < HALF
         far = np.full(CELLS * CELLS, -EMPTY, np.float32)
         np.maximum.at(far, column[within], depth[within])
-        grid[1] = np.where(far > -EMPTY, far, EMPTY)
-        return grid.reshape(2, CELLS, CELLS)
+        return np.stack([near, np.where(far > -EMPTY, far, EMPTY)]).reshape(2, CELLS, CELLS)
 
 
 def cloud(depth: RegisteredDepth) -> Float32[np.ndarray, "n 3"]:
-    """Every measured point of a frame: colour camera's frame, metres."""
-    row, column = np.nonzero(depth.z)
-    uv = np.stack([column, row], 1).astype(np.float64)
-    return depth.camera.unproject(uv, depth.z[row, column].astype(np.float64)).astype(np.float32)
+    """Every measured point of a frame, row by row: colour camera's frame, metres; each axis is contiguous in memory."""
+    c = depth.camera
+    rays = _rays(c.width, c.height, c.K.tobytes(), c.distortion_model, c.distortion)
+    pixel = np.flatnonzero(depth.z.ravel() > 0)
+    z = depth.z.ravel()[pixel]
+    out = np.empty((3, len(z)), np.float32)
+    np.multiply(rays[0, pixel], z, out=out[0])
+    np.multiply(rays[1, pixel], z, out=out[1])
+    out[2] = z
+    return out.T
+
+
+@lru_cache(maxsize=4)
+def _rays(width: int, height: int, K: bytes, model: str, distortion: tuple[float, ...]) -> Float32[np.ndarray, "2 n"]:
+    """X/Z and Y/Z of every pixel of a camera, row by row."""
+    camera = Camera(width, height, np.frombuffer(K).reshape(3, 3), model, distortion)
+    v, u = np.mgrid[0:height, 0:width].astype(np.float64)
+    return np.ascontiguousarray(camera.normalized(np.stack([u.ravel(), v.ravel()], 1)).T, dtype=np.float32)
 
 
 def rotation_to(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import Final
+from typing import Any, Final
 
 import understudy
 from understudy.assets import cache_dir
@@ -17,7 +17,7 @@ from understudy.lifting import Lifter, NaiveLifter
 OURS, NO_ASSEMBLY, PAPER_ASSEMBLY = "voxelposenet", "voxelposenet, no assembly", "voxelposenet, paper's assembly"
 
 _COMMON = ("camera", "geometry", "lifting", "registration", "skeleton", "types")
-_VOXELS = ("roots", "voxels", "voxel_lifting", "runtime", "voxelposenet/predictor")
+_VOXELS = ("roots", "voxels", "voxel_lifting", "assembly", "runtime", "voxelposenet/predictor")
 _PAPER = ("voxelposenet/paper_grid", "voxelposenet/paper_net", "voxelposenet/paper_lifter")
 
 
@@ -54,12 +54,13 @@ def available(weights: Weights) -> tuple[dict[str, Method], list[str]]:
     return found, notes
 
 
-def of_network(name: str, weights: Path | None, assembly: str = "uncertainty") -> Method:
+def of_network(name: str, weights: Path | None, assembly: str | None = None) -> Method:
     """The default method, perhaps with other weights or another assembly."""
     from understudy.voxel_lifting import VoxelLifter
 
     network = network_file(weights)
-    return Method(name, lambda: VoxelLifter(weights=network, assembly=assembly), fingerprint(_VOXELS, network))
+    options: dict[str, Any] = {} if assembly is None else {"assembly": assembly}
+    return Method(name, lambda: VoxelLifter(weights=network, **options), fingerprint(_VOXELS, network))
 
 
 def network_file(weights: Path | None) -> Path:
@@ -136,8 +137,8 @@ class _Paper:
 
 @dataclass(frozen=True)
 class _Network:
-    assembly: str
-    """of voxel_lifting.ASSEMBLIES"""
+    assembly: str | None
+    """of assembly.ASSEMBLIES; None: the lifter's own choice"""
 
     def __call__(self, name: str, weights: Weights) -> Method:
         return of_network(name, weights.network, self.assembly)
@@ -150,7 +151,7 @@ _REGISTRY: Final = MappingProxyType[str, Callable[[str, Weights], Method]](
         "mlp": _mlp,
         "paper-fast": _Paper("paper_fast", "--paper-fast"),
         "paper": _Paper("paper", "--paper"),
-        OURS: _Network("uncertainty"),
+        OURS: _Network(None),
         NO_ASSEMBLY: _Network("network"),
         PAPER_ASSEMBLY: _Network("paper"),
     }

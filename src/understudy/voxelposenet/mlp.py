@@ -163,7 +163,7 @@ def train_mlp(
         "people": str(number * _FRESH), "minutes": f"{(time.monotonic() - start) / 60:.1f}",
     }  # fmt: skip
     if steps is not None:
-        del about["minutes"]  # the same file each time
+        del about["minutes"]
     write_atomically(out, save({k: v.contiguous() for k, v in net.state_dict().items()}, about))
     return net.eval()
 

@@ -124,7 +124,8 @@ class VoxelPoseNet(nn.Module):
         x8 = self.merge8(F.relu(x8 + self.up8(x4)))
         x16 = self.merge16(F.relu(x16 + self.up16(x8)))
         logits = self.score(x16).reshape(b, N_JOINTS, 8, COARSE**3).float()
-        return logits, self._read(logits, self.features(x16), keypoints)
+        # The judge must not bend what it judges: it sees features and distribution, but sends no gradient into them.
+        return logits, self._read(logits, self.features(x16.detach()), keypoints)
 
     def _flat_input(self, depth: Tensor, keypoints: Tensor) -> Tensor:
         """Score maps, and the nearest depth with its mask."""
@@ -164,14 +165,13 @@ class VoxelPoseNet(nn.Module):
         p = logits.reshape(b, N_JOINTS, -1).softmax(-1)
         mean = p @ self.centers
         spread = (p @ self.centers**2 - mean**2).clamp_min(1e-6).sqrt()
-        place = p.reshape(b, N_JOINTS, 8, -1).sum(2)
+        place = p.detach().reshape(b, N_JOINTS, 8, -1).sum(2)
         local = place @ features.float().reshape(b, features.shape[1], -1).transpose(1, 2)
         uv, score = keypoints[..., :2], keypoints[..., 2:]
         off = ((mean[..., :2] - uv).abs() / 0.1).clamp_max(5) * (score > 0)
         peak = p.amax(-1, keepdim=True).clamp_min(1e-6).log() / 5
         said = torch.cat([spread.log(), off, score, (score > 0).to(score.dtype), peak], -1)
-        # The judge must not bend what it judges: it sees the distribution, but sends no gradient into it.
-        judged = self.judge(torch.cat([local.detach() + self.embedding, said.detach()], -1))
+        judged = self.judge(torch.cat([local + self.embedding, said.detach()], -1))
         return Output(mean, spread, judged)
 
 
