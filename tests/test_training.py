@@ -37,7 +37,7 @@ def quiet(tmp_path_factory):
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("UNDERSTUDY_CACHE", str(tmp_path_factory.mktemp("cache")))
+        patch.setenv("UNDERSTUDY_CACHE", str(tmp_path_factory.getbasetemp() / "bodies"))
         yield
     torch.set_num_threads(before)
 

@@ -46,7 +46,7 @@ def add(commands: argparse._SubParsersAction) -> None:
 def _export(arguments: argparse.Namespace) -> None:
     with needs_extra("exporting weights", "train"):
         from understudy.voxelposenet.publish import publish
-    for path in publish(arguments.source, arguments.out):
+    for path in publish(arguments.source, arguments.out, progress=True):
         print(f"  {path}")
 
 

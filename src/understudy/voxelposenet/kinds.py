@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple, Protocol, runtime_checkable
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -111,7 +112,8 @@ class PaperKind:
             volumes.append(net(made.input)[-1])
             origins.append(made.origin)
         metres, score = paper_data.peaks(torch.cat(volumes), torch.cat(origins))
-        sigma = sigma_of_score(score.cpu().numpy(), paper_data.cell_size(self.config.grid))
+        cell = paper_data.cell_size(self.config.grid)
+        sigma = np.stack([sigma_of_score(s, cell) for s in score.double().cpu().numpy()])
         joints = paper_data.assembled(metres, score, batch)
         return Estimate(joints, torch.as_tensor(sigma, dtype=score.dtype, device=score.device), score.clamp(0, 1))
 
