@@ -33,27 +33,45 @@ def shoulder_width(p: Person) -> float:
     return float(np.linalg.norm(p.keypoints[JOINT["right_shoulder"]] - p.keypoints[JOINT["left_shoulder"]]))
 
 
-@pytest.mark.parametrize("who", [2, 3])
-def test_shoulder_widths_of_those_who_face_the_camera(men, who):
+@pytest.mark.parametrize("who", range(4))
+def test_shoulder_widths(men, who):
+    """Two of them stand in profile: a depth under the far shoulder is the near one's."""
     assert 0.25 < shoulder_width(men[who]) < 0.55
 
 
-@pytest.mark.parametrize("who", [0, 1])
-@pytest.mark.xfail(strict=True, reason="naive lifting puts the far shoulder of a man in profile on his near side")
-def test_shoulder_widths_of_those_in_profile(men, who):
-    """Known miss of the baseline (0.12 and 0.20 m); the voxel network has to mend it, and then this test says so."""
-    assert 0.25 < shoulder_width(men[who]) < 0.55
+@pytest.mark.parametrize("who", range(4))
+def test_both_sides_are_alike(men, who):
+    for a, b in (("shoulder", "elbow"), ("elbow", "wrist"), ("hip", "knee"), ("knee", "ankle")):
+        right, left = (
+            np.linalg.norm(men[who].keypoints[JOINT[f"{side}_{a}"]] - men[who].keypoints[JOINT[f"{side}_{b}"]])
+            for side in ("right", "left")
+        )
+        assert abs(right - left) < 0.15 * max(right, left), (a, b)
 
 
-def test_joints_project_onto_their_keypoints(men, freiburg):
-    camera = recordings.open(freiburg).camera.color
-    for p in men:
+@pytest.mark.parametrize("who", range(4))
+def test_statures_of_men(men, who):
+    """Along the bones from the soles to the top of the head; ankles are 0.08 m high, and 0.11 m is above the eyes."""
+    joint = dict(zip(JOINT, men[who].keypoints, strict=True))
+    hips, eyes = ((joint[f"right_{n}"] + joint[f"left_{n}"]) / 2 for n in ("hip", "eye"))
+
+    def length(*places: np.ndarray) -> float:
+        return float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum())
+
+    legs = [length(joint[f"{s}_hip"], joint[f"{s}_knee"], joint[f"{s}_ankle"]) for s in ("right", "left")]
+    assert 1.55 < length(eyes, joint["neck"], hips) + float(np.mean(legs)) + 0.08 + 0.11 < 1.95
+
+
+def test_naive_joints_project_onto_their_keypoints(models, freiburg):
+    recording = recordings.open(freiburg)
+    camera = recording.camera.color
+    for p in Estimator("naive").estimate(recording[0]):
         given = np.isfinite(p.keypoints).all(1)
         np.testing.assert_allclose(camera.project(p.keypoints[given]), p.keypoints_2d.uv[given], atol=1e-6)
 
 
 def test_sample_is_found_where_it_is(models):
-    """The bundled recording: both people in every frame, visible joints at their true places within naive's limits."""
+    """The bundled recording: both people in every frame, all joints near their true places, hidden ones too."""
     from understudy.metrics import evaluate
     from understudy.people_file import FramePeople
 
@@ -64,8 +82,9 @@ def test_sample_is_found_where_it_is(models):
     truth = type(recording.truth)({f.index: recording.truth.frames[f.index] for f in frames})
     scores = evaluate(frames, truth)
     assert (scores.counts.missed, scores.counts.false) == (0, 0)
-    assert scores.joints["visible"].epe_m < 0.07
-    assert scores.joints["visible"].coverage > 0.97
+    assert scores.joints["visible"].epe_m < 0.05
+    assert scores.joints["occluded"].epe_m < 0.12
+    assert scores.joints["visible"].coverage == scores.joints["occluded"].coverage == 1
 
 
 class Fixed:
@@ -85,7 +104,7 @@ class Fixed:
 def test_any_detector_will_do(flat_frame: Frame):
     rows_ = np.column_stack([np.linspace(100, 800, 18), np.linspace(100, 500, 18), np.ones(18)])
     detector = Fixed(Keypoints2D.from_rows(rows_), Keypoints2D.from_rows(rows_ - (5, 5, 0)))
-    estimator = Estimator(detector=detector)
+    estimator = Estimator("naive", detector)
     people = estimator.estimate(flat_frame)
     assert [p.id for p in people] == [0, 1] and detector.indices == [0]
     again = estimator.estimate(estimator.register(flat_frame))  # registered already

@@ -44,7 +44,8 @@ def recording(tmp_path):
 
 
 def run(recording, out, **options):
-    return estimate_recording(recordings.open(recording), out, detector="recording", **options)
+    """By the naive method, whose joints are known exactly."""
+    return estimate_recording(recordings.open(recording), out, **{"method": "naive", "detector": "recording", **options})
 
 
 def test_whole_recording(recording, tmp_path):
@@ -252,17 +253,30 @@ def test_a_frame_without_a_keypoint_file_is_skipped(recording, tmp_path):
     assert [len(f.people) for f in result.frames] == [1, 1, 0, 0, 1]
 
 
-def test_all_zero_depth_lists_everybody_as_failed(tmp_path, capsys):
+@pytest.fixture
+def no_depth(tmp_path):
+    """One frame with two people and not a single depth."""
     frame = Frame(np.zeros((120, 160, 3), np.uint8), np.zeros((120, 160), np.float32), CAMERA)
     recordings.write_recording(tmp_path / "REC", [frame], keypoints2d={0: [seen(10), seen(60)]})
-    assert main(["estimate", str(tmp_path / "REC"), "--detector", "recording", "--out", str(tmp_path / "out")]) == 0
+    return ["estimate", str(tmp_path / "REC"), "--detector", "recording", "--out", str(tmp_path / "out")]
+
+
+def test_without_depth_naive_lists_everybody_as_failed(no_depth, tmp_path, capsys):
+    assert main([*no_depth, "--method", "naive"]) == 0
     people = json.loads((tmp_path / "out" / "people.json").read_text())["frames"][0]["people"]
     assert [p["failed"] for p in people] == ["no depth near any of the 2D keypoints"] * 2
     assert "2 of them could not be lifted" in capsys.readouterr().out
 
 
+def test_without_depth_the_network_infers_everybody(no_depth, tmp_path):
+    assert main(no_depth) == 0
+    people = json.loads((tmp_path / "out" / "people.json").read_text())["frames"][0]["people"]
+    assert [set(p["source"]) for p in people] == [{"inferred"}] * 2
+    assert all(len(row) == 3 for p in people for row in p["keypoints"])
+
+
 def test_estimator_refuses_what_it_does_not_know():
-    with pytest.raises(UnderstudyError, match="method 'magic': must be one of 'naive'"):
+    with pytest.raises(UnderstudyError, match="method 'magic': must be one of 'voxelposenet', 'naive'"):
         Estimator("magic")
     with pytest.raises(UnderstudyError, match="min_score 2"):
         Estimator(min_score=2)
@@ -279,7 +293,7 @@ def test_estimator_refuses_what_it_does_not_know():
         (["estimate", "REC", "--color", "c.png", "--out", "OUT"], "--color goes with a pair of images"),
         (["info", "REC", "--unit", "0.001"], "--unit goes with a pair of images"),
         (["estimate", "REC", "--out", "OUT", "--detector", "yolo"], "detector 'yolo': must be one of"),
-        (["estimate", "REC", "--out", "OUT", "--method", "magic"], "method 'magic': must be one of 'naive'"),
+        (["estimate", "REC", "--out", "OUT", "--method", "magic"], "method 'magic': must be one of 'voxelposenet', 'naive'"),
         (["view", "OUT"], "people.json"),
         (["benchmark", "REC", "--out", "OUT"], "truth.json"),
         (["benchmark", "REC", "--methods", "magic"], "method 'magic'"),

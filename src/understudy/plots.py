@@ -154,7 +154,7 @@ def _sigma(axes: Axes, evaluations: Mapping[str, Evaluation]) -> None:
         axes.annotate(f" {100 * expected:.1f}", (x + 0.44, 100 * expected), va="center", fontsize=9)
     axes.set_xlim(-0.5, 1.62)
     axes.set_xticks([0, 1], ["within 1 sigma", "within 2 sigma"])
-    axes.set(title="Errors within sigma (bar above its line: sigma too large)", ylabel="joints, %", ylim=(0, 100))
+    axes.set(title="Errors within sigma (bar above its line: sigma too large)", ylabel="joints, %", ylim=(0, 106))
     axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.11), fontsize=9, ncols=2)
 
 
@@ -166,7 +166,8 @@ def _bars(axes: Axes, heights: Mapping[str, list[float]], label_bars: bool = Fal
         bars = axes.bar(x, np.nan_to_num(values), width * 0.92, label=method, color=_style(i)["color"])
         if label_bars:
             texts = ["" if np.isnan(v) else f"{v:.{digits}f}" for v in values]
-            axes.bar_label(bars, texts, label_type="center", color="white", fontsize=9)
+            turned = 90 if digits and len(heights) > 4 else 0
+            axes.bar_label(bars, texts, label_type="center", color="white", fontsize=9, rotation=turned)
     axes.grid(axis="y", alpha=0.3)
     axes.set_axisbelow(True)
 

@@ -54,11 +54,12 @@ class VoxelLifter:
             [keypoint_input(v, frame.camera, p, self.min_score) for v, (p, _) in zip(views, each, strict=True)]
         )
         said = self.predictor(views, depth, rows)
-        return [self._person(p, *with_it) for (p, _), *with_it in zip(each, views, rows, said, strict=True)]
+        return [self._person(*pair, *with_it) for pair, *with_it in zip(each, views, rows, said, strict=True)]
 
-    def _person(self, seen: Keypoints2D, view: PersonView, rows: Rows, said: Prediction) -> Person:
+    def _person(self, seen: Keypoints2D, root: Root, view: PersonView, rows: Rows, said: Prediction) -> Person:
         joints = view.to_cam(self._assemble(said, rows, view))
-        source = np.where((said.seen > 0.5) & (rows[:, 2] > 0), OBSERVED, INFERRED)
+        observed = (said.seen > 0.5) & (rows[:, 2] > 0) & (root.evidence == "depth")
+        source = np.where(observed, OBSERVED, INFERRED)
         return Person(seen, joints, said.confidence, said.sigma, tuple(source.tolist()))
 
 

@@ -26,7 +26,7 @@ from understudy.pipeline import signature
 from understudy.recordings.base import Recording
 from understudy.registration import register
 from understudy.skeleton import N_JOINTS
-from understudy.types import Keypoints2D, RegisteredFrame
+from understudy.types import Keypoints2D, Person
 
 DEGRADED: Final = ("naive", "naive-offset", "mlp", *NETWORK)
 """methods that are run on every quality of 2D keypoints, not only on the detections"""
@@ -171,13 +171,17 @@ def _lift(
     for index in dict.fromkeys(subjects.frame.tolist()):
         frame = register(recording.frame(index))
         here = np.flatnonzero(subjects.frame == index)
-        for (quality, name), lifted in out.items():
-            _fill(lifted, here, frame, lifters[name], rows[quality][here])
+        for name, lifter in lifters.items():  # all qualities at once: each person is lifted by themselves
+            keys = [key for key in out if key[1] == name]
+            seen = [Keypoints2D.from_rows(row) for quality, _ in keys for row in rows[quality][here]]
+            people = lifter.lift(frame, seen)
+            for k, key in enumerate(keys):
+                _fill(out[key], here, people[k * len(here) : (k + 1) * len(here)])
     return out
 
 
-def _fill(lifted: Lifted, here: np.ndarray, frame: RegisteredFrame, lifter: Lifter, rows: np.ndarray) -> None:
-    for i, person in zip(here, lifter.lift(frame, [Keypoints2D.from_rows(r) for r in rows]), strict=True):
+def _fill(lifted: Lifted, here: np.ndarray, people: Sequence[Person]) -> None:
+    for i, person in zip(here, people, strict=True):
         given = np.isfinite(person.keypoints).all(1)
         lifted.keypoints[i] = np.where(given[:, None], person.keypoints, np.nan)
         lifted.confidence[i] = np.where(given, person.confidence, np.nan)

@@ -110,7 +110,7 @@ def _evaluations(group: Group, keys: Mapping[str, Key]) -> dict[str, Evaluation]
 
 def draw(group: Group) -> dict[str, bytes]:
     """File name -> PNG."""
-    keys, some = main_keys(group), few(group)
+    keys, some, title = main_keys(group), few(group), f"{group.title}, joints in view"
     lifted = {name: group.lifted[key] for name, key in keys.items()}
     shares = {name: pck_over_distance(group.subjects, one)[0] for name, one in lifted.items()}
     counts = pck_over_distance(group.subjects, next(iter(lifted.values())))[1]
@@ -121,13 +121,13 @@ def draw(group: Group) -> dict[str, bytes]:
         if m in group.methods
     }
     drawn = {
-        "pck": plots.pck_curves(_evaluations(group, keys), group.title),
-        "distance": plots.pck_over_distance(shares, counts, DISTANCES_M, group.title),
-        "joints": plots.joint_bars(_evaluations(group, some), group.title),
+        "pck": plots.pck_curves(_evaluations(group, keys), title),
+        "distance": plots.pck_over_distance(shares, counts, DISTANCES_M, title),
+        "joints": plots.joint_bars(_evaluations(group, some), title),
         "quality": plots.grouped_bars(
             auc, qualities, "AUC (0-20 cm), joints in view", f"Quality of the 2D keypoints: {group.title}", digits=2
         ),
-        "calibration": plots.calibration(_evaluations(group, some), group.title),
+        "calibration": plots.calibration(_evaluations(group, some), title),
     }
     return {f"{group.slug}-{name}.png": png for name, png in drawn.items()}
 

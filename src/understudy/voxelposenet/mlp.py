@@ -30,7 +30,7 @@ from understudy.voxelposenet.loss import COVERED, WITHIN, _distance, metric_erro
 from understudy.voxels import HALF
 
 _FRESH = 64  # new people per round
-_ROUND = 25  # steps of optimisation per round
+_ROUND = 15  # steps of optimisation per round
 _BATCH = 256  # people per step, from all so far
 _POOL = 200_000  # people that are kept
 
