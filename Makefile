@@ -20,7 +20,9 @@ help:
 demo: $(VENV)/user.stamp
 	$(BIN)/understudy models fetch
 	$(BIN)/understudy estimate sample --out demo
+	$(BIN)/understudy compare sample --out demo/compare.png
 	@echo; echo "Made by 'make demo' (look at these):"; ls demo/overlays/*.png; echo demo/people.json; \
+	  echo "demo/compare.png: network and naive lifting side by side, on a person whom the desk hides"; \
 	  echo "In 3D: $(BIN)/understudy view demo"
 
 test: $(VENV)/dev.stamp

@@ -200,14 +200,14 @@ def test_learns_eight_people_by_heart():
 
     batch = Samples(capsule_bank(2, seed=3, points=2000), seed=5).batch(0, 8)
     torch.manual_seed(0)
-    net = VoxelPoseNet(NetConfig(channels=(8, 16, 16), channels_2d=24, lifted=4))
-    optimizer = torch.optim.Adam(net.parameters(), lr=2e-2)
+    net = VoxelPoseNet(NetConfig(channels=(8, 16, 32), channels_2d=16, lifted=4))
+    optimizer = torch.optim.Adam(net.parameters(), lr=3e-2)
     errors = []
-    for _ in range(28):
+    for _ in range(18):
         logits, out = net.scores(batch.depth, batch.keypoints, batch.root_z)
         total, parts = loss(logits, out, batch.joints, batch.root_z, batch.in_view & ~batch.occluded)
         optimizer.zero_grad()
         total.backward()
         optimizer.step()
         errors.append(parts["error"].item())
-    assert errors[0] > 0.3 and errors[-1] < 0.2, errors
+    assert errors[0] > 0.4 and errors[-1] < 0.22, errors

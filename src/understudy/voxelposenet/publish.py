@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shlex
-from collections.abc import Iterable
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
@@ -73,10 +73,10 @@ def _calibrated(net: VoxelPoseNet, config: TrainConfig, samples: int, progress: 
     return summary(collect(net, _bar(halves[1], "scoring", progress)))
 
 
-def _bar(batches: Batches, what: str, show: bool) -> Iterable[Batch]:
+def _bar(batches: Batches, what: str, show: bool) -> Iterator[Batch]:
     from tqdm import tqdm
 
-    return tqdm((batches[i] for i in range(len(batches))), total=len(batches), desc=what, disable=not show)
+    yield from tqdm(batches, total=len(batches), desc=what, disable=not show)
 
 
 def _card(
