@@ -45,7 +45,9 @@ def recording(tmp_path):
 
 def run(recording, out, **options):
     """By the naive method, whose joints are known exactly."""
-    return estimate_recording(recordings.open(recording), out, **{"method": "naive", "detector": "recording", **options})
+    return estimate_recording(
+        recordings.open(recording), out, **{"method": "naive", "detector": "recording", **options}
+    )
 
 
 def test_whole_recording(recording, tmp_path):
@@ -293,7 +295,10 @@ def test_estimator_refuses_what_it_does_not_know():
         (["estimate", "REC", "--color", "c.png", "--out", "OUT"], "--color goes with a pair of images"),
         (["info", "REC", "--unit", "0.001"], "--unit goes with a pair of images"),
         (["estimate", "REC", "--out", "OUT", "--detector", "yolo"], "detector 'yolo': must be one of"),
-        (["estimate", "REC", "--out", "OUT", "--method", "magic"], "method 'magic': must be one of 'voxelposenet', 'naive'"),
+        (
+            ["estimate", "REC", "--out", "OUT", "--method", "magic"],
+            "method 'magic': must be one of 'voxelposenet', 'naive'",
+        ),
         (["view", "OUT"], "people.json"),
         (["benchmark", "REC", "--out", "OUT"], "truth.json"),
         (["benchmark", "REC", "--methods", "magic"], "method 'magic'"),

@@ -1,0 +1,83 @@
+"""The voxel method as a whole, with the weights that come with the package."""
+
+import hashlib
+
+import numpy as np
+import pytest
+
+from understudy import methods, recordings
+from understudy.errors import UnderstudyError
+from understudy.registration import register
+from understudy.skeleton import JOINT
+from understudy.types import Keypoints2D, RegisteredDepth, RegisteredFrame
+from understudy.voxel_lifting import VoxelLifter
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """The bundled recording's third frame and its true 2D keypoints; of hidden joints, too."""
+    recording = recordings.open("sample")
+    frame = register(recording.frame(2))
+    truth = recording.truth.frames[2]
+    seen = [Keypoints2D.where(frame.camera.project(t.keypoints), np.where(t.occluded, 0.4, 0.9)) for t in truth]
+    return frame, truth, seen
+
+
+def error(person, truth) -> np.ndarray:
+    return np.linalg.norm(person.keypoints - truth.keypoints, axis=1)
+
+
+def test_hidden_joints_are_found(scene):
+    frame, truth, seen = scene
+    for person, true in zip(VoxelLifter().lift(frame, seen), truth, strict=True):
+        assert error(person, true)[true.occluded].mean() < 0.1
+        assert error(person, true)[~true.occluded].mean() < 0.05
+
+
+def test_every_frame_every_run_the_same_bits(scene):
+    frame, _, seen = scene
+
+    def digest() -> str:
+        people = VoxelLifter().lift(frame, seen)
+        return hashlib.sha256(b"".join(p.keypoints.tobytes() + p.sigma_m.tobytes() for p in people)).hexdigest()
+
+    assert digest() == digest()
+
+
+def test_people_do_not_depend_on_each_other(scene):
+    frame, _, seen = scene
+    together = VoxelLifter().lift(frame, seen)
+    alone = [VoxelLifter().lift(frame, [p])[0] for p in seen]
+    for a, b in zip(together, alone, strict=True):
+        np.testing.assert_allclose(a.keypoints, b.keypoints, atol=1e-4)
+
+
+def test_something_before_the_trunk_does_not_take_the_root(scene):
+    """A board, half a metre before the camera, over most of a person's trunk: the paper's root would lie on it."""
+    frame, truth, seen = scene
+    z = frame.depth.z.copy()
+    uv = seen[1].uv * frame.depth.scale_to(frame.camera)
+    (left, top), (right, bottom) = uv[[2, 5, 8, 11]].min(0).astype(int) - 8, uv[[2, 5, 8, 11]].max(0).astype(int) + 8
+    middle = (top + 2 * bottom) // 3
+    z[top:middle, left:right] = 0.5
+    blocked = RegisteredFrame(frame.color, frame.camera, RegisteredDepth(z, frame.depth.camera), 2)
+    person = VoxelLifter().lift(blocked, [seen[1]])[0]
+    assert np.median(error(person, truth[1])) < 0.2
+    neck = seen[1].uv[JOINT["neck"]] * frame.depth.scale_to(frame.camera)
+    assert z[int(neck[1]), int(neck[0])] == np.float32(0.5)
+
+
+def test_nobody_and_nothing(scene):
+    frame, *_ = scene
+    assert VoxelLifter().lift(frame, []) == []
+    (person,) = VoxelLifter().lift(frame, [Keypoints2D(np.zeros((18, 2)), np.zeros(18))])
+    assert person.failed == "no usable 2D keypoint" and np.isnan(person.keypoints).all()
+
+
+def test_wrong_names(tmp_path):
+    with pytest.raises(UnderstudyError, match="assembly 'glue': must be one of 'uncertainty', 'paper', 'network'"):
+        VoxelLifter(assembly="glue")
+    with pytest.raises(UnderstudyError, match="method 'naive' has none"):
+        methods.create("naive", weights=tmp_path / "x.onnx")
+    with pytest.raises(UnderstudyError, match="no such file"):
+        VoxelLifter(weights=tmp_path / "x.onnx")
