@@ -84,11 +84,11 @@ def _bones(x: Float[np.ndarray, "18 3"]) -> tuple[Float[np.ndarray, "12"], Float
     length = np.maximum(np.linalg.norm(bone, axis=1), 0.02)
     along = bone / length[:, None]
     n = len(_ENDS)
-    slope = np.zeros((n, N_JOINTS, 3))
+    ends = np.zeros((n, N_JOINTS, 3))
     row = np.arange(n)
-    slope[row, _ENDS[:, 0]] = along
-    slope[row, _ENDS[:, 1]] = -along
-    slope = slope.reshape(n, -1)
+    ends[row, _ENDS[:, 0]] = along
+    ends[row, _ENDS[:, 1]] = -along
+    slope = ends.reshape(n, -1)
     sides = _SIGMA_SIDES * _LENGTHS[::2]
     residual = [(length - _LENGTHS) / (_SIGMA_LENGTH * _LENGTHS), (length[::2] - length[1::2]) / sides]
     jacobian = [slope / (_SIGMA_LENGTH * _LENGTHS)[:, None], (slope[::2] - slope[1::2]) / sides[:, None]]

@@ -41,8 +41,8 @@ def draw_methods(
     for name, each in people.items():
         canvas = Canvas(np.full((height, width, 3), _BACKGROUND, np.uint8))
         _points(canvas, frame, low, high, scale)
-        for person in truth:
-            _skeleton(canvas, _place(person.keypoints, low, scale), None)
+        for true in truth:
+            _skeleton(canvas, _place(true.keypoints, low, scale), None)
         for person in each:
             _skeleton(canvas, _place(person.keypoints, low, scale), person)
         canvas.text(f"{name}, from the side{_score(each, truth)}", (4, 4), WHITE)

@@ -80,7 +80,8 @@ class PersonView:
         limited to +-LIMIT; `EMPTY` where nothing was measured. One value or a hundred in a column make no difference,
         so that coarse and fine sensors look alike.
         """
-        x, y, z = self.R_view_cam.astype(points.dtype) @ points.T
+        # einsum, not @: BLAS would wake its threads, and they spin on after it while the network needs the cores.
+        x, y, z = np.einsum("ij,nj->in", self.R_view_cam.astype(points.dtype), points)
         scale = points.dtype.type(self.root_z / CELL)
         edge = z * points.dtype.type(CELLS // 2)
         x, y = x * scale, y * scale
