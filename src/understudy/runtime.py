@@ -76,7 +76,6 @@ def load(path: Path, *, threads: int | None = None, streams: int = 1, outputs: S
         "PERFORMANCE_HINT": "LATENCY",
         "NUM_STREAMS": streams,
         "ENABLE_CPU_PINNING": False,  # other programs use these cores, too
-        "CPU_DENORMALS_OPTIMIZATION": True,  # the tails of score maps are such numbers, and slow
     }
     if threads is not None:
         config["INFERENCE_NUM_THREADS"] = threads
