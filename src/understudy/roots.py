@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from understudy.camera import Camera
 from understudy.lifting import nearest_depths
-from understudy.skeleton import JOINT, JOINTS, N_JOINTS, TORSO, rows
+from understudy.skeleton import JOINT, N_JOINTS, TORSO, rows
 from understudy.types import Keypoints2D, RegisteredDepth
 
 _BONES_M: Final = {
@@ -91,11 +91,6 @@ def find_roots(person: Keypoints2D, depth: RegisteredDepth, camera: Camera, min_
     return [Root(_behind_surface(np.append(_center(ray, z) * z, z)), evidence) for z, evidence in places]
 
 
-def find_root(person: Keypoints2D, depth: RegisteredDepth, camera: Camera, min_score: float = 0.2) -> Root | None:
-    """The likeliest of `find_roots`; None when there is none."""
-    return next(iter(find_roots(person, depth, camera, min_score)), None)
-
-
 def _behind_surface(point: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
     return point * (1 + _INSIDE / np.linalg.norm(point))
 
@@ -164,6 +159,3 @@ def _center(ray: Float[np.ndarray, "18 2"], z: float) -> Float[np.ndarray, "2"]:
     torso = ray[TORSO]
     torso = torso[np.isfinite(torso).all(1)]
     return torso.mean(0) + 0.7 * down if len(torso) else np.nanmean(ray, axis=0)
-
-
-assert all(name in JOINTS for pair in _BONES_M for name in pair)

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Float32
+from scipy.special import expit
 
 from understudy import runtime
 from understudy.camera import Camera
@@ -60,8 +61,8 @@ class Predictor:
                 j.astype(np.float64),
                 s.astype(np.float64),
                 np.exp(h[:, 0].astype(np.float64)),
-                _sigmoid(h[:, 1]),
-                _sigmoid(h[:, 2]),
+                expit(h[:, 1].astype(np.float64)),
+                expit(h[:, 2].astype(np.float64)),
             )
             for j, s, h in zip(joints, spread, head, strict=True)
         ]
@@ -74,7 +75,3 @@ def keypoint_input(
     xy = view.columns(camera, person.uv)
     use = person.found & (person.score >= min_score) & np.isfinite(xy).all(1)
     return np.where(use[:, None], np.column_stack([xy, person.score]), 0.0).astype(np.float32)
-
-
-def _sigmoid(x: np.ndarray) -> np.ndarray:
-    return 1 / (1 + np.exp(-x.astype(np.float64)))
