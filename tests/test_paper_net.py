@@ -283,7 +283,7 @@ def test_import_pickle(tmp_path, fast, protocol):
     # protocol 0 is text and slow: the small half of the variables shows as much
     small = {n: a for n, a in fast.items() if protocol > 2 or a.size < 3e4}
     path.write_bytes(pickle.dumps({**small, "global_step": np.int64(40000)}, protocol))
-    from understudy.voxelposenet.tensorflow_weights import read_pickle
+    from understudy.voxelposenet.array_pickle import read_pickle
 
     got = read_pickle(path)
     assert got.pop("global_step") == 40000
