@@ -43,6 +43,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         help="leave a depth camera out of training (validation keeps it); may be repeated",
     )  # fmt: skip
     parser.add_argument("--bvh", type=Path, metavar="FOLDER", help="motion capture to draw poses from")
+    parser.add_argument("--init", type=Path, metavar="FILE", help="weights to begin with, in place of random ones")
     parser.add_argument("--device", metavar="NAME", help="cpu or cuda")
     parser.add_argument("--seed", type=int, metavar="N", help="of weights and data")
     parser.add_argument("--workers", type=int, metavar="N", help="processes that simulate; 0: the training one itself")
@@ -111,4 +112,6 @@ def _config(arguments: argparse.Namespace) -> TrainConfig:
         if left == changed.samples.sensors:
             raise UnderstudyError(f"--without-sensor {name!r}: must be {one_of(changed.samples.sensors)}")
         changed = replace(changed, samples=replace(changed.samples, sensors=left))
+    if arguments.init is not None:
+        given["init"] = str(arguments.init)
     return replace(config, data=changed, **given)

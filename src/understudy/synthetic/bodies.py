@@ -32,7 +32,7 @@ REGIONS: Final = (
 REGION: Final = MappingProxyType({name: i for i, name in enumerate(REGIONS)})
 """Name -> code in `BodyBank.region`."""
 
-VERSION: Final = 4
+VERSION: Final = 5
 """of the cached banks; to be raised whenever the same seed gives other bodies"""
 
 _FACE_ROWS = [JOINT[n] for n in ("nose", "right_eye", "left_eye", "right_ear", "left_ear")]

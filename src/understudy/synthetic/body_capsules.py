@@ -389,6 +389,8 @@ def people(
 
     origins = torch.stack([origin[name] for name in SEGMENTS], 1)
     joints = origins[:, list(JOINT_SEGMENT)].clone()
+    for side, _ in SIDES:  # where annotators of COCO put hips: outside of the centre of rotation
+        joints[:, JOINT[f"{side}_hip"]] *= _HIP
     joints[:, JOINT["nose"]] = at(0, -0.112 * head, top - 0.148 * size)
     for side, sign in SIDES:
         joints[:, JOINT[f"{side}_eye"]] = at(sign * 0.032 * head, -0.088 * head, top - 0.115 * size)
@@ -403,6 +405,7 @@ def _smooth(t: Tensor) -> Tensor:
     return t * t * (3 - 2 * t)
 
 
+_HIP = torch.tensor([1.24, 1.0, 1.0])  # a COCO hip's place against the thigh's centre of rotation
 _NEIGHBOURS = {
     # part: (segment before, half width of the blend, segment after, half width of the blend), in shares of the length
     "upper_arm": ("clavicle", 0.22, "forearm", 0.14),

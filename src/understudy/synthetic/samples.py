@@ -16,7 +16,7 @@ from understudy.synthetic.bodies import BodyBank, pose, pose_extra
 from understudy.synthetic.clothing import dress
 from understudy.synthetic.detections import DetectorConfig, detect
 from understudy.synthetic.draw import Draw
-from understudy.synthetic.furniture import place_boxes
+from understudy.synthetic.furniture import FLOOR, place_boxes
 from understudy.synthetic.poses import NAMES, sample_poses
 from understudy.synthetic.scene import Boxes, Cameras, SceneConfig, about_z, place_cameras
 from understudy.synthetic.sensors import Rig
@@ -28,6 +28,10 @@ _PITCH: Final = CELL / 2
 """Metres of a pixel at the root."""
 LEAST_SEEN: Final = 4
 """Joints that the camera must see of a person."""
+_REACH: Final = 0.6
+"""Metres by which a person's middle must be nearer than the farthest depth of the sensor."""
+_CAMERAS: Final = 3
+"""How often a camera is drawn, at most, until it sees the person."""
 FROM_BEHIND: Final = -0.3
 """Cosine between where somebody faces and the camera, below which they turn their back."""
 _FRONTAL = 0.7  # the same: above, a person is frontal
@@ -110,14 +114,28 @@ class Samples:
 
     @torch.no_grad()
     def batch(self, number: int, size: int) -> Batch:
-        """Batch `number`."""
+        """Batch `number`: of somewhat more people, the first `size` that a detector would find."""
+        b = size + 1 + size // 8
         draw = Draw((self.seed * 1_000_003 + number) % 2**63, self.device)
-        people = self._people(draw, size)
-        cameras = place_cameras(draw, self.config.scene, people.joints)
+        people = self._people(draw, b)
+        rig = Rig(draw, self.config.sensors, b)
+        cameras = self._cameras(draw, people, rig)
         boxes = place_boxes(draw, self.config.scene, cameras, people.joints, people.sits)
+        boxes = _unhiding(boxes, cameras, rig, people.joints)
         others = self._others(draw, people, cameras)
-        rig = Rig(draw, self.config.sensors, size)
-        return self._observe(draw, people, others, cameras, boxes, rig)
+        return _detectable(self._observe(draw, people, others, cameras, boxes, rig), size)
+
+    def _cameras(self, draw: Draw, people: People, rig: Rig) -> Cameras:
+        """Cameras that see enough of the main person, no farther than the depth camera measures."""
+
+        def drawn() -> Cameras:
+            return place_cameras(draw, self.config.scene, people.joints, rig.max_z - _REACH)
+
+        cameras = drawn()
+        for _ in range(_CAMERAS - 1):
+            enough = rig.in_color(cameras.to_cam(people.joints)).sum(1) > LEAST_SEEN
+            cameras = cameras.where(enough, drawn())
+        return cameras
 
     def _people(self, draw: Draw, b: int) -> People:
         """Posed bodies on the floor at the world's origin, turned at random."""
@@ -178,8 +196,8 @@ class Samples:
     ) -> Batch:
         """What depth camera and detector say of the main people."""
         joints_cam = cameras.to_cam(people.joints)
-        in_view = rig.seen_by(rig.color_tan, joints_cam) & (joints_cam[..., 2] > 0.15)
-        center, root_z = view.draw_root(draw, joints_cam, in_view)
+        in_view = rig.in_color(joints_cam)
+        center, root_z = view.draw_root(draw, joints_cam, in_view, rig.seen_by(rig.depth_tan, joints_cam, rig.pitch))
         R = view.rotation_to(center)  # R_view_cam
         joints = joints_cam @ R.transpose(1, 2)
         columns = view.columns(joints, root_z)
@@ -208,7 +226,7 @@ class Samples:
         )
         hard = (front < _FRONTAL) | before
         tag = torch.stack([rig.kind, people.activity.to(rig.kind.dtype)], -1)
-        return _detectable(Batch(depth, keypoints, root_z[:, None], columns, in_view, occluded, hard, tag))
+        return Batch(depth, keypoints, root_z[:, None], columns, in_view, occluded, hard, tag)
 
 
 def hidden_joints(
@@ -262,12 +280,21 @@ def _measured(
     return view.depth_grid(cloud, ok, root_z)
 
 
-def _detectable(batch: Batch) -> Batch:
-    """People of whom a detector sees nearly nothing give their place to the next one who is seen."""
-    seen = (batch.in_view & ~batch.occluded).sum(1) >= LEAST_SEEN
-    number = torch.arange(len(seen), device=seen.device)
-    after = (number[None] - number[:, None]) % len(seen) + torch.where(seen, 0, 2 * len(seen))[None]
-    chosen = after.argmin(1)
+def _unhiding(boxes: Boxes, cameras: Cameras, rig: Rig, joints: Float[Tensor, "b 18 3"]) -> Boxes:
+    """Without the furniture that stands before people of whom hardly anything would be seen."""
+    distance, which = render.cast_which(boxes, cameras.center, joints - cameras.center[:, None])
+    hit = distance < 0.97
+    lost = (rig.in_color(cameras.to_cam(joints)) & ~hit).sum(1, keepdim=True) <= LEAST_SEEN
+    number = torch.arange(boxes.yaw.shape[1], device=joints.device)
+    gone = ((which[..., None] == number) & (hit & lost)[..., None]).any(1)
+    gone[:, FLOOR] = False
+    return boxes.without(gone)
+
+
+def _detectable(batch: Batch, size: int) -> Batch:
+    """The first `size` people of whom a detector sees enough; others only when there are not as many."""
+    unseen = (batch.in_view & ~batch.occluded).sum(1) < LEAST_SEEN
+    chosen = torch.argsort(unseen.int(), stable=True)[:size]
     return Batch(*(t[chosen] for t in batch))
 
 
@@ -278,6 +305,8 @@ def _occluded(
     scale: Float[Tensor, " b"],
 ) -> tuple[Bool[Tensor, "b 18"], Bool[Tensor, " b"]]:
     """Which joints have a surface clearly before them, and whether furniture is before several of a person's joints.
+
+    Judged from the depth camera, whose exact image there is; the colour camera is at most 8 cm beside it.
 
     joints: depth camera's place, view's axes. exact, people: depth of everything, and of people only. Metres.
     """

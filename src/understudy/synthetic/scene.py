@@ -37,6 +37,11 @@ class Cameras:
     center: Float[Tensor, "b 3"]
     """in the world"""
 
+    def where(self, chosen: Bool[Tensor, " b"], other: Cameras) -> Cameras:
+        """These cameras in the chosen scenes, the others in the rest."""
+        R = torch.where(chosen[:, None, None], self.R_cam_world, other.R_cam_world)
+        return Cameras(R, torch.where(chosen[:, None], self.center, other.center))
+
     def to_cam(self, points: Float[Tensor, "b n 3"]) -> Float[Tensor, "b n 3"]:
         """World -> colour camera's frame (OpenCV's axes)."""
         return (points - self.center[:, None]) @ self.R_cam_world.transpose(1, 2)
@@ -79,10 +84,19 @@ def about_z(angle: Float[Tensor, " b"]) -> Float[Tensor, "b 3 3"]:
     return torch.stack([c, -s, o, s, c, o, o, o, o + 1], -1).reshape(-1, 3, 3)
 
 
-def place_cameras(draw: Draw, config: SceneConfig, body: Float[Tensor, "b n 3"]) -> Cameras:
-    """Cameras that look roughly at the main person. body: the person's joints in the world (for the aim)."""
+def place_cameras(
+    draw: Draw, config: SceneConfig, body: Float[Tensor, "b n 3"], farthest: Float[Tensor, " b"] | None = None
+) -> Cameras:
+    """Cameras that look roughly at the main person.
+
+    body: the person's joints in the world (for the aim). farthest: horizontal distance (metres) that is not exceeded,
+    per scene.
+    """
     b = len(body)
-    low, high = config.distance_m
+    low = config.distance_m[0]
+    high = torch.full((b,), config.distance_m[1], device=body.device)
+    if farthest is not None:
+        high = high.minimum(farthest).clamp_min(low)
     distance = low + (high - low) * draw.uniform(0, 1, b) ** 1.2
     height = draw.uniform(*config.height_m, b)
     # The person stands at the origin and is turned at random, so the camera may as well always be at -y.

@@ -28,8 +28,6 @@ class Sensor:
     """the same of the depth image"""
     depth_pitch: float
     """radians by which the depth camera looks down against the colour camera"""
-    pixel: float
-    """tangent of one depth pixel's angle"""
     baseline: tuple[float, float]
     """metres from the colour to the depth camera: between these, to either side"""
     sigma: tuple[float, float, float]
@@ -52,7 +50,6 @@ SENSORS: Final = MappingProxyType(
             color_tan=(0.89, 0.50),
             depth_tan=(0.70, 0.58),
             depth_pitch=0.0,
-            pixel=1 / 365,
             baseline=(0.045, 0.06),
             sigma=(0.0015, -0.0005, 0.0003),
             smooth=0,
@@ -65,7 +62,6 @@ SENSORS: Final = MappingProxyType(
             color_tan=(1.02, 0.58),
             depth_tan=(0.63, 0.57),
             depth_pitch=0.105,
-            pixel=1 / 504,
             baseline=(0.025, 0.04),
             sigma=(0.0005, 0.0010, 0.0),
             smooth=0,
@@ -78,7 +74,6 @@ SENSORS: Final = MappingProxyType(
             color_tan=(0.69, 0.39),
             depth_tan=(1.0, 0.60),
             depth_pitch=0.0,
-            pixel=1 / 425,
             baseline=(0.01, 0.055),
             sigma=(0.001, 0.0, 0.0038),
             smooth=3.0,
@@ -91,7 +86,6 @@ SENSORS: Final = MappingProxyType(
             color_tan=(0.62, 0.48),
             depth_tan=(0.66, 0.5),
             depth_pitch=0.0,
-            pixel=1 / 300,
             baseline=(0.0, 0.08),
             sigma=(0.002, 0.0, 0.002),
             smooth=1.5,
@@ -107,6 +101,7 @@ SENSORS: Final = MappingProxyType(
 _EDGE = 0.08  # metres: a step between neighbouring pixels that counts as an edge
 _FARTHEST = 9.0  # metres: flying pixels are not drawn farther back than this
 _NEAREST = 0.25  # metres: nothing nearer is measured
+_NEAREST_COLOR = 0.15  # metres, the same for the colour camera
 _LEAST_SIGMA = 0.0005  # metres
 
 
@@ -129,7 +124,6 @@ class Rig:
         self.color_tan = torch.stack([column([s.color_tan[i] for s in table]) * vary for i in (0, 1)], -1)
         self.depth_tan = torch.stack([column([s.depth_tan[i] for s in table]) * vary for i in (0, 1)], -1)
         self.pitch = column([s.depth_pitch for s in table])
-        self.pixel = column([s.pixel for s in table]) * draw.lognormal(0.2, b)
         low, high = column([s.baseline[0] for s in table]), column([s.baseline[1] for s in table])
         side = torch.where(draw.chance(0.5, b), 1.0, -1.0)
         across = side * draw.uniform(low, high, b)
@@ -184,6 +178,10 @@ class Rig:
         """Axial noise (one sigma, metres) of a surface that faces the camera at these depths."""
         c0, c1, c2 = (_per_scene(self.sigma[:, i]) for i in range(3))
         return (c0 + c1 * z + c2 * z * z).clamp_min(_LEAST_SIGMA)
+
+    def in_color(self, points: Float[Tensor, "b n 3"]) -> Bool[Tensor, "b n"]:
+        """Which points (colour camera's frame, metres) lie in the colour image and not right before the camera."""
+        return self.seen_by(self.color_tan, points) & (points[..., 2] > _NEAREST_COLOR)
 
     def seen_by(
         self, tangent: Float[Tensor, "b 2"], direction: Float[Tensor, "b n 3"], pitch: Tensor | None = None

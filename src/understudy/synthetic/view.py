@@ -6,9 +6,11 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from understudy.skeleton import TORSO
 from understudy.synthetic.draw import Draw
 from understudy.voxels import CELL, CELLS, EMPTY, HALF, LIMIT
 
+_SIZE_SIGMA = 0.08  # relative error of a distance that is judged by a person's size
 _NEAREST_Z = 0.1  # metres: nothing nearer to the camera is measured
 
 
@@ -45,10 +47,13 @@ def depth_grid(
     return torch.stack([near, far], 1).reshape(b, 2, CELLS, CELLS)
 
 
-def draw_root(draw: Draw, joints: Float[Tensor, "b 18 3"], in_view: Bool[Tensor, "b 18"]) -> tuple[Tensor, Tensor]:
+def draw_root(
+    draw: Draw, joints: Float[Tensor, "b 18 3"], in_view: Bool[Tensor, "b 18"], measured: Bool[Tensor, "b 18"]
+) -> tuple[Tensor, Tensor]:
     """(B, 3) a point on the view's axis and (B,) the root's depth, metres, with the errors that they have in practice.
 
-    joints: colour camera's frame.
+    joints: colour camera's frame. measured: which of them lie in the depth camera's image; where no joint of the trunk
+    does, the depth is known from the person's apparent size only.
     """
     b = len(joints)
     neck, hips = joints[:, 1], (joints[:, 8] + joints[:, 11]) / 2
@@ -61,5 +66,7 @@ def draw_root(draw: Draw, joints: Float[Tensor, "b 18 3"], in_view: Bool[Tensor,
     sigma = torch.where(draw.chance(0.15, b), 0.15, 0.03)[:, None]
     center = center + sigma * draw.normal(b, 3)
     z_sigma = torch.where(draw.chance(0.12, b), 0.2, 0.05)
-    root_z = center.norm(dim=-1) - 0.08 + z_sigma * draw.normal(b)
+    distance = center.norm(dim=-1)
+    z_sigma = torch.where(measured[:, TORSO].any(-1), z_sigma, _SIZE_SIGMA * distance)
+    root_z = distance - 0.08 + z_sigma * draw.normal(b)
     return center, root_z.clamp_min(0.4)

@@ -11,14 +11,15 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from understudy.errors import ModelFileError
 from understudy.synthetic.samples import Batch
 from understudy.voxelposenet import paper_data
-from understudy.voxelposenet.checkpoint import save_weights
+from understudy.voxelposenet.checkpoint import load_net, save_weights
 from understudy.voxelposenet.loss import loss
 from understudy.voxelposenet.net import VoxelPoseNet
 from understudy.voxelposenet.paper_lifter import sigma_of_score
 from understudy.voxelposenet.paper_net import PaperNet, paper_loss
-from understudy.voxelposenet.tensorflow_weights import save_paper_weights
+from understudy.voxelposenet.tensorflow_weights import read_paper_weights, save_paper_weights
 from understudy.voxelposenet.train_config import TrainConfig
 
 
@@ -57,6 +58,10 @@ class Kind(Protocol):
         """Writes weights, with words about them."""
         ...
 
+    def load(self, path: Path) -> None:
+        """Puts weights that `save` wrote into the network. Raises ModelFileError for those of another network."""
+        ...
+
 
 class DefaultKind:
     """`VoxelPoseNet` with its loss."""
@@ -87,6 +92,12 @@ class DefaultKind:
 
     def save(self, path: Path, state: Mapping[str, Tensor], about: Mapping[str, str]) -> None:
         save_weights(path, state, self.config.net, about)
+
+    def load(self, path: Path) -> None:
+        given = load_net(path)
+        if given.config != self.config.net:
+            raise ModelFileError(f"{path}: weights of a network of {given.config}, must be {self.config.net}")
+        self.net.load_state_dict(given.state_dict())
 
 
 class PaperKind:
@@ -126,6 +137,10 @@ class PaperKind:
         net = PaperNet(self.config.network)
         net.load_state_dict(state)
         save_paper_weights(net.variables(), path, about)
+
+    def load(self, path: Path) -> None:
+        weights, _ = read_paper_weights(path)
+        self.net.load_variables(weights, str(path))
 
 
 def make(config: TrainConfig, device: torch.device) -> Kind:

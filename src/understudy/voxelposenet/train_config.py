@@ -53,6 +53,10 @@ class TrainConfig:
     """largest norm of the gradient; 0 = any"""
     bf16: bool = True
     """bfloat16 autocast"""
+    compile: bool = True
+    """through torch.compile, which needs a C++ compiler and a minute at the start, and is 1.4 times as fast"""
+    init: str | None = None
+    """file of weights to begin with in place of random ones"""
     seed: int = 0
     validation_samples: int = 512
     validation_seed: int = 1_000_003
@@ -101,17 +105,17 @@ PRESETS: Final = MappingProxyType(
             net=NetConfig(channels=(8, 8, 8), channels_2d=8, lifted=2),
             data=DataConfig(bodies="capsules", capsules=4),
             steps=6, batch=4, warmup=2, validation_samples=8, validate_every=3, checkpoint_every=2, log_every=1,
-            workers=0,
+            workers=0, compile=False,
         ),
         "paper": TrainConfig(
             network="paper-fast", steps=40_000, batch=2, learning_rate=1e-4, warmup=0, schedule="steps",
-            weight_decay=0.0, ema=0.0, clip=0.0, bf16=False,
+            weight_decay=0.0, ema=0.0, clip=0.0, bf16=False, compile=False,
         ),
     }
 )  # fmt: skip
 """Name -> configuration. `smoke` proves that everything runs; `paper` is the published network and schedule."""
 
-FREE: Final = ("steps", "workers", "device", "checkpoint_every", "log_every", "validate_every", "plots")
+FREE: Final = ("steps", "workers", "device", "checkpoint_every", "log_every", "validate_every", "plots", "compile")
 """What may change when a run goes on."""
 
 
