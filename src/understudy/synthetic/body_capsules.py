@@ -36,6 +36,9 @@ ARM_DOWN, LEG_OUT = 0.8, 0.09
 SHOULDER_BELOW = 0.042
 """The shoulder's centre lies this much lower than the acromion (metres)."""
 
+_COCO_HIP = 1.24
+"""Distance of a hip from the middle, against that of the thigh's axis."""
+
 
 @dataclass(frozen=True)
 class Part:
@@ -346,7 +349,8 @@ def people(
         down = torch.tensor([sign * d, 0.0, -c])
         hip_o = at(sign * hip_x, 0, 0)
         knee, ankle = hip_o + thigh[:, None] * down, hip_o + (thigh + shin)[:, None] * down
-        origin |= {f"{side}_thigh": hip_o, f"{side}_shin": knee, f"{side}_foot": ankle}
+        # The joint is where annotators of COCO put hips, outside of the thigh's axis: the same place as in anny.
+        origin |= {f"{side}_thigh": hip_o * _COCO_HIP, f"{side}_shin": knee, f"{side}_foot": ankle}
         leg = _frame(torch.tensor([0.0, 1.0, 0.0]), down)
         r = limb * sexed(1.0, 1.02) * vary(0.04)
         wide = knots(*(v * r for v in (0.088, 0.086, 0.064, 0.056)))
@@ -389,8 +393,6 @@ def people(
 
     origins = torch.stack([origin[name] for name in SEGMENTS], 1)
     joints = origins[:, list(JOINT_SEGMENT)].clone()
-    for side, _ in SIDES:  # where annotators of COCO put hips: outside of the centre of rotation
-        joints[:, JOINT[f"{side}_hip"]] *= _HIP
     joints[:, JOINT["nose"]] = at(0, -0.112 * head, top - 0.148 * size)
     for side, sign in SIDES:
         joints[:, JOINT[f"{side}_eye"]] = at(sign * 0.032 * head, -0.088 * head, top - 0.115 * size)
@@ -405,7 +407,6 @@ def _smooth(t: Tensor) -> Tensor:
     return t * t * (3 - 2 * t)
 
 
-_HIP = torch.tensor([1.24, 1.0, 1.0])  # a COCO hip's place against the thigh's centre of rotation
 _NEIGHBOURS = {
     # part: (segment before, half width of the blend, segment after, half width of the blend), in shares of the length
     "upper_arm": ("clavicle", 0.22, "forearm", 0.14),

@@ -115,7 +115,7 @@ class Samples:
     @torch.no_grad()
     def batch(self, number: int, size: int) -> Batch:
         """Batch `number`: of somewhat more people, the first `size` that a detector would find."""
-        b = size + 1 + size // 8
+        b = size + 1 + size // 32
         draw = Draw((self.seed * 1_000_003 + number) % 2**63, self.device)
         people = self._people(draw, b)
         rig = Rig(draw, self.config.sensors, b)
