@@ -139,6 +139,12 @@ def test_joints_lie_inside_the_body(bank: BodyBank) -> None:
     assert (face[:, :, None] - bank.points[:, None]).norm(dim=3).amin(2).max() < 0.045
 
 
+def test_hips_are_where_annotators_put_them(bank: BodyBank) -> None:
+    posed = pose(bank, everybody(bank), bank.align.mT)
+    apart = (posed.joints[:, JOINT["right_hip"]] - posed.joints[:, JOINT["left_hip"]]).norm(dim=1)
+    assert 0.2 < apart.mean() < 0.25
+
+
 def test_statures_follow_ansur() -> None:
     g = torch.Generator().manual_seed(3)
     female = ansur.draw_sex(4000, g)

@@ -24,8 +24,8 @@ from understudy.synthetic.bodies import capsule_bank  # noqa: E402
 from understudy.synthetic.detections import DetectorConfig, detect  # noqa: E402
 from understudy.synthetic.draw import Draw  # noqa: E402
 from understudy.synthetic.recording import RecordingConfig, Studio, write_synthetic  # noqa: E402
-from understudy.synthetic.samples import SampleConfig, Samples  # noqa: E402
-from understudy.synthetic.scene import Boxes, SceneConfig  # noqa: E402
+from understudy.synthetic.samples import LEAST_SEEN, SampleConfig, Samples, unhiding  # noqa: E402
+from understudy.synthetic.scene import Boxes, SceneConfig, place_cameras  # noqa: E402
 from understudy.synthetic.sensors import SENSORS, Rig  # noqa: E402
 
 ALONE = SceneConfig(occluder=0.0, furniture=0, neighbours=0.0)
@@ -161,6 +161,40 @@ def test_a_batch_is_a_function_of_seed_and_number(bank):
     assert all(torch.equal(a, b) for a, b in zip(first, next(other.stream(4, start=2)), strict=True))
     for different in (other.batch(3, 4), Samples(bank, config, 4).batch(2, 4)):
         assert not torch.equal(first.depth, different.depth) and not torch.equal(first.joints, different.joints)
+
+
+def test_nobody_is_in_a_batch_twice(bank):
+    joints = Samples(bank, seed=8).batch(0, 64).joints.reshape(64, -1)
+    assert len(joints.unique(dim=0)) == 64
+
+
+def test_people_stand_where_the_depth_camera_measures(bank):
+    config = SampleConfig(sensors=("realsense",), scene=SceneConfig(occluder=0, neighbours=0))
+    batch = Samples(bank, config, seed=8).batch(0, 64)
+    assert (batch.in_view & ~batch.occluded).sum(1)[:-8].min() >= LEAST_SEEN
+    on_person = (batch.depth[:, 0].abs() < 0.5).flatten(1).sum(1)
+    assert (on_person > 20).all()
+
+
+def test_furniture_that_hides_everything_goes():
+    config, rig = SceneConfig(distance_m=(3.0, 3.1)), Rig(Draw(1), ("kinect2",), 4)
+    joints = torch.tensor([0.0, 0.0, 1.0]) + 0.3 * torch.rand(4, 18, 3, generator=torch.Generator().manual_seed(1))
+    cameras = place_cameras(Draw(2), replace(config, aim_sigma_m=0.0), joints)
+    middle = (cameras.center + joints.mean(1)) / 2
+    center = torch.stack([torch.tensor([0.0, 0.0, -0.5]).expand(4, 3), middle, joints.mean(1) + 2.0], 1)
+    half = torch.tensor([[9.0, 9.0, 0.5], [1.0, 0.1, 1.5], [0.1, 0.1, 0.1]]).expand(4, 3, 3)
+    boxes = Boxes(center, half, torch.zeros(4, 3))
+    left = unhiding(boxes, cameras, rig, joints)
+    assert (left.center[:, 1, 2] < -50).all()
+    assert torch.equal(left.center[:, [0, 2]], center[:, [0, 2]])
+
+
+def test_a_root_without_depth_is_judged_by_size():
+    joints = torch.tensor([0.0, 0.0, 4.0]).expand(4000, 18, 3)
+    yes = torch.ones(4000, 18, dtype=torch.bool)
+    spread = [float(view.draw_root(Draw(3), joints, yes, measured)[1].std()) for measured in (yes, ~yes)]
+    assert spread[0] < 0.12
+    assert spread[1] == pytest.approx(0.32, rel=0.1)
 
 
 def test_batches_are_what_the_network_takes(bank):

@@ -117,6 +117,34 @@ def test_damaged_checkpoint(finished, tmp_path, damage):
         Trainer(SMALL, tmp_path)
 
 
+def test_a_run_begins_with_given_weights(finished, tmp_path):
+    given = finished / "weights.safetensors"
+    trainer = Trainer(replace(SMALL, init=str(given), seed=5), tmp_path / "on")
+    for net in (trainer.net, trainer.averaged()):
+        state = net.state_dict()
+        assert all(torch.equal(state[k], v) for k, v in load_file(given).items())
+    other = replace(SMALL, init=str(given), net=replace(SMALL.net, lifted=3))
+    with pytest.raises(ModelFileError, match=r"weights\.safetensors: .*lifted=2.* must be .*lifted=3"):
+        Trainer(other, tmp_path / "other")
+
+
+def test_training_is_compiled_when_asked(tmp_path, monkeypatch):
+    """Compiling takes a minute, and not with these tests' type checks: whether it is asked for is what is tested."""
+    monkeypatch.setenv("CXX", sys.executable)
+    asked = []
+    monkeypatch.setattr(torch.nn.Module, "compile", lambda net, *a, **k: asked.append(type(net).__name__))
+    for choice in (False, True):
+        Trainer(replace(SMALL, steps=1, compile=choice), tmp_path / str(choice)).run()
+    assert asked == ["_Learning"]
+
+
+def test_without_a_compiler_training_is_only_slower(tmp_path, monkeypatch):
+    monkeypatch.setenv("CXX", "no-such-compiler")
+    with pytest.warns(UserWarning, match="'no-such-compiler' was not found"):
+        Trainer(replace(SMALL, steps=1, compile=True), tmp_path / "run").run()
+    assert (tmp_path / "run/weights.safetensors").exists()
+
+
 def test_another_configuration_does_not_mix(finished):
     for config, words in (
         (replace(SMALL, batch=3), "another batch (2, now 3)"),

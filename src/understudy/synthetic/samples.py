@@ -121,7 +121,7 @@ class Samples:
         rig = Rig(draw, self.config.sensors, b)
         cameras = self._cameras(draw, people, rig)
         boxes = place_boxes(draw, self.config.scene, cameras, people.joints, people.sits)
-        boxes = _unhiding(boxes, cameras, rig, people.joints)
+        boxes = unhiding(boxes, cameras, rig, people.joints)
         others = self._others(draw, people, cameras)
         return _detectable(self._observe(draw, people, others, cameras, boxes, rig), size)
 
@@ -280,7 +280,7 @@ def _measured(
     return view.depth_grid(cloud, ok, root_z)
 
 
-def _unhiding(boxes: Boxes, cameras: Cameras, rig: Rig, joints: Float[Tensor, "b 18 3"]) -> Boxes:
+def unhiding(boxes: Boxes, cameras: Cameras, rig: Rig, joints: Float[Tensor, "b 18 3"]) -> Boxes:
     """Without the furniture that stands before people of whom hardly anything would be seen."""
     distance, which = render.cast_which(boxes, cameras.center, joints - cameras.center[:, None])
     hit = distance < 0.97

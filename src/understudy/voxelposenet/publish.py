@@ -105,6 +105,7 @@ every joint a mean, a spread, the radius that holds 68 % of errors, and the prob
 ## Training
 
 - Command: `{shlex.join(map(str, about.get("command", [])))}`
+- Began with: {config.init or "random weights"}.
 - Machine: {machine}; torch {about.get("torch", "unknown")}.
 - Steps: {last.get("step", "unknown")} of {config.batch} people per process; hours: {last.get("hours", "unknown")}.
 - Seeds: weights and data {config.seed}, bodies {data.bodies_seed}, validation {config.validation_seed}.
@@ -113,7 +114,8 @@ every joint a mean, a spread, the radius that holds 68 % of errors, and the prob
 ## Scores
 
 Of the network alone (no assembly), on simulated people, bodies and scenes that neither training nor calibration saw,
-all sensors. The scenes are hard: nearly half of the joints are hidden. Errors are means in cm over joints in view.
+with the sensors above. The scenes are hard: nearly half of the joints are hidden. Errors are means in cm over joints in
+view.
 
 | number | value |
 |---|---|
