@@ -103,7 +103,7 @@ def test_no_depth_at_all_leaves_the_apparent_size():
         assert root.evidence == "size"
         assert abs(root.point[2] / z - 1) < 0.25
     head = find(person(only=tuple(JOINTS[i] for i in FACE)), nothing)
-    assert head.evidence == "size" and abs(head.point[2] - 3) < 0.6
+    assert head.evidence == "size" and abs(head.point[2] / 3 - 1) < 0.25
 
 
 def test_only_the_wall_behind_is_measured():

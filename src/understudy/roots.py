@@ -8,34 +8,16 @@ far too short has had the depth of something nearer to the camera.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 from jaxtyping import Float
 
+from understudy.apparent_size import distance_of_size
 from understudy.camera import Camera
 from understudy.lifting import nearest_depths
 from understudy.skeleton import JOINT, N_JOINTS, TORSO, rows
 from understudy.types import Keypoints2D, RegisteredDepth
 
-_BONES_M: Final = {
-    ("right_shoulder", "left_shoulder"): 0.34,
-    ("neck", "right_hip"): 0.51,
-    ("neck", "left_hip"): 0.51,
-    ("right_shoulder", "right_elbow"): 0.30,
-    ("left_shoulder", "left_elbow"): 0.30,
-    ("right_elbow", "right_wrist"): 0.25,
-    ("left_elbow", "left_wrist"): 0.25,
-    ("right_hip", "right_knee"): 0.42,
-    ("left_hip", "left_knee"): 0.42,
-    ("right_knee", "right_ankle"): 0.40,
-    ("left_knee", "left_ankle"): 0.40,
-}
-_ENDS = np.array([[JOINT[a], JOINT[b]] for a, b in _BONES_M])
-_LENGTHS = np.array(list(_BONES_M.values()))
-_HEAD_ENDS = np.array([rows("right_ear", "left_ear"), rows("right_eye", "left_eye"), rows("neck", "nose")])
-_HEAD_LENGTHS = np.array([0.15, 0.063, 0.2])
-_DISTANCES = (0.5, 8.0)  # metres: of people from the camera
 _USUAL = 2.5  # metres: the distance of a person of whom nothing tells it
 # Places on the trunk: shares of (neck, right shoulder, left shoulder, right hip, left hip).
 _PLACES = np.array(
@@ -48,7 +30,7 @@ _AGREE = 0.22  # metres: depths of one torso lie within
 _LIMBS = np.array([i for i in range(N_JOINTS) if i not in TORSO])
 # Votes: of the places on the trunk, of the depth component, of the limbs (thin: what is behind them is near), of size.
 _WEIGHTS = np.concatenate([np.ones(len(_PLACES)), [3.0], np.full(len(_LIMBS), 0.15), [0.4]])
-_SIZE_SIGMA_NEAR, _SIZE_SIGMA_FAR = 0.45, 0.2  # of the log of depth over the depth that the apparent size asks for
+_SIZE_NEAR, _SIZE_FAR = 0.45, 0.2  # least sigma of the log of depth over the depth that the apparent size asks for
 _RIVAL = 0.2  # share of the winner's votes that makes a second place worth a look
 _MOST = 3
 _APART = 0.45  # metres between two places that are worth a look
@@ -80,14 +62,14 @@ def find_roots(person: Keypoints2D, depth: RegisteredDepth, camera: Camera, min_
         return []
     uv = np.where(usable[:, None], person.uv, np.nan)
     ray = camera.normalized(uv)
-    sized = _depth_of_size(ray)
+    sized, sigma = _depth_of_size(ray)
     trunk = np.median(nearest_depths(depth, camera, _on_trunk(uv)), axis=1)
     limbs = np.median(nearest_depths(depth, camera, uv[_LIMBS]), axis=1)
-    places = _elected(np.concatenate([trunk, [person.torso_z or np.nan], limbs, [sized or np.nan]]), sized)
-    if not places:  # one or two keypoints, and nothing to measure them by: any depth is better than none
+    places = _elected(np.concatenate([trunk, [person.torso_z or np.nan], limbs, [sized]]), sigma)
+    if not places:  # nothing to measure the keypoints by: any depth is better than none
         values = nearest_depths(depth, camera, uv, k=1, radius=0.1)
         near = values[np.isfinite(values)]
-        places = [(float(np.median(near)), "depth") if len(near) else (_depth_of_head(ray), "size")]
+        places = [(float(np.median(near)), "depth") if len(near) else (_USUAL, "size")]
     return [Root(_behind_surface(np.append(_center(ray, z) * z, z)), evidence) for z, evidence in places]
 
 
@@ -101,28 +83,22 @@ def _on_trunk(uv: Float[np.ndarray, "18 2"]) -> Float[np.ndarray, "9 2"]:
     return np.where(_PLACES[..., None] > 0, _PLACES[..., None] * corners, 0.0).sum(1)
 
 
-def _depth_of_size(ray: Float[np.ndarray, "18 2"]) -> float | None:
-    """The depth at which the person's longest-looking bones have an adult's lengths; None with too few joints.
-
-    A bone that points along the view looks short, never long; so large ratios count, not the mean.
-    """
-    length = np.linalg.norm(ray[_ENDS[:, 0]] - ray[_ENDS[:, 1]], axis=1)
-    ratio = np.sort(length[np.isfinite(length)] / _LENGTHS[np.isfinite(length)])[::-1]
-    if not len(ratio) or ratio[0] <= 0:
-        return None
-    some = ratio[1:5] if len(ratio) > 4 else ratio[:2]  # the longest of many is often a misplaced keypoint
-    return float(1 / some.mean())
-
-
-def _depth_of_head(ray: Float[np.ndarray, "18 2"]) -> float:
-    """As `_depth_of_size`, by the head alone; where not even that can be measured, a usual distance."""
-    length = np.linalg.norm(ray[_HEAD_ENDS[:, 0]] - ray[_HEAD_ENDS[:, 1]], axis=1)
-    ratio = length[length > 0] / _HEAD_LENGTHS[length > 0]
-    return float(np.clip(1 / ratio.max(), *_DISTANCES)) if len(ratio) else _USUAL
+def _depth_of_size(ray: Float[np.ndarray, "18 2"]) -> tuple[float, float]:
+    """z of the trunk at the person's apparent distance, and one sigma of its log; NaN where nothing tells it."""
+    found = distance_of_size(ray)
+    if found is None:
+        return np.nan, np.nan
+    distance, sigma = found
+    torso = ray[TORSO]
+    torso = torso[np.isfinite(torso).all(1)]
+    middle = torso.mean(0) if len(torso) else np.nanmean(ray, axis=0)
+    return distance / float(np.sqrt(1 + middle @ middle)), sigma
 
 
-def _elected(values: np.ndarray, sized: float | None) -> list[tuple[float, str]]:
+def _elected(values: np.ndarray, sigma: float) -> list[tuple[float, str]]:
     """The depths on which most of `values` agree, and the evidence for each; the best first.
+
+    The last value is that of the apparent size, with one sigma of its log.
 
     Each value votes for those near it. What would make the person a dwarf or a giant counts less, so that a few depths
     of an occluder or of the background do not outvote the rest, but many that agree win over a wrong size. A bone may
@@ -132,9 +108,9 @@ def _elected(values: np.ndarray, sized: float | None) -> list[tuple[float, str]]
     chosen, weights = values[valid], _WEIGHTS[valid]
     measured = np.arange(len(values))[valid] < len(values) - 1
     credible = np.ones(len(chosen))
-    if sized is not None:
-        off = np.log(chosen / sized)
-        credible = np.exp(-0.5 * (off / np.where(off < 0, _SIZE_SIGMA_NEAR, _SIZE_SIGMA_FAR)) ** 2)
+    if valid[-1]:
+        off = np.log(chosen / values[-1])
+        credible = np.exp(-0.5 * (off / np.maximum(sigma, np.where(off < 0, _SIZE_NEAR, _SIZE_FAR))) ** 2)
     near = np.abs(chosen[:, None] - chosen) < _AGREE
     votes = (near @ weights) * credible
     places: list[tuple[float, str]] = []
