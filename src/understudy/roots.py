@@ -31,7 +31,8 @@ _LIMBS = np.array([i for i in range(N_JOINTS) if i not in TORSO])
 # Votes: of the places on the trunk, of the depth component, of the limbs (thin: what is behind them is near), of size.
 _WEIGHTS = np.concatenate([np.ones(len(_PLACES)), [3.0], np.full(len(_LIMBS), 0.15), [0.4]])
 _SIZE_NEAR, _SIZE_FAR = 0.45, 0.2  # least sigma of the log of depth over the depth that the apparent size asks for
-_RIVAL = 0.2  # share of the winner's votes that makes a second place worth a look
+_RIVAL = 0.1  # share of the winner's votes that makes a second place worth a look
+_ENOUGH = 3.0  # votes; fewer do not support a place fully, even when all agree
 _MOST = 3
 _APART = 0.45  # metres between two places that are worth a look
 _INSIDE = 0.08  # metres from the trunk's surface to its middle
@@ -45,6 +46,8 @@ class Root:
 
     point: Float[np.ndarray, "3"]
     """metres, colour camera's frame"""
+    support: float
+    """share of the votes, 0 to 1: depths at the person that agree with it, and how credible it makes the size"""
     evidence: str
     """`depth`, or `size`: no depth was near the person that its apparent size allows"""
 
@@ -69,8 +72,8 @@ def find_roots(person: Keypoints2D, depth: RegisteredDepth, camera: Camera, min_
     if not places:  # nothing to measure the keypoints by: any depth is better than none
         values = nearest_depths(depth, camera, uv, k=1, radius=0.1)
         near = values[np.isfinite(values)]
-        places = [(float(np.median(near)), "depth") if len(near) else (_USUAL, "size")]
-    return [Root(_behind_surface(np.append(_center(ray, z) * z, z)), evidence) for z, evidence in places]
+        places = [(float(np.median(near)), 1.0, "depth") if len(near) else (_USUAL, 0.0, "size")]
+    return [Root(_behind_surface(np.append(_center(ray, z) * z, z)), share, kind) for z, share, kind in places]
 
 
 def _behind_surface(point: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
@@ -95,8 +98,8 @@ def _depth_of_size(ray: Float[np.ndarray, "18 2"]) -> tuple[float, float]:
     return distance / float(np.sqrt(1 + middle @ middle)), sigma
 
 
-def _elected(values: np.ndarray, sigma: float) -> list[tuple[float, str]]:
-    """The depths on which most of `values` agree, and the evidence for each; the best first.
+def _elected(values: np.ndarray, sigma: float) -> list[tuple[float, float, str]]:
+    """The depths on which most of `values` agree, their share of the votes, and the evidence; the best first.
 
     The last value is that of the apparent size, with one sigma of its log.
 
@@ -113,12 +116,14 @@ def _elected(values: np.ndarray, sigma: float) -> list[tuple[float, str]]:
         credible = np.exp(-0.5 * (off / np.maximum(sigma, np.where(off < 0, _SIZE_NEAR, _SIZE_FAR))) ** 2)
     near = np.abs(chosen[:, None] - chosen) < _AGREE
     votes = (near @ weights) * credible
-    places: list[tuple[float, str]] = []
+    support = votes / max(weights.sum(), _ENOUGH)
+    places: list[tuple[float, float, str]] = []
     least = _RIVAL * votes.max(initial=0)
     while len(places) < _MOST and len(votes) and votes.max() > least:
         best = int(np.argmax(votes))
         voters = near[best] & measured
-        places.append((float(np.median(chosen[voters])), "depth") if voters.any() else (float(chosen[best]), "size"))
+        z = float(np.median(chosen[voters]) if voters.any() else chosen[best])
+        places.append((z, float(support[best]), "depth" if voters.any() else "size"))
         votes = np.where(np.abs(chosen - places[-1][0]) < _APART, -1.0, votes)
     return places
 
