@@ -29,7 +29,7 @@ _PLACES = np.array(
 _AGREE = 0.22  # metres: depths of one torso lie within
 _LIMBS = np.array([i for i in range(N_JOINTS) if i not in TORSO])
 # Votes: of the places on the trunk, of the depth component, of the limbs (thin: what is behind them is near), of size.
-_WEIGHTS = np.concatenate([np.ones(len(_PLACES)), [3.0], np.full(len(_LIMBS), 0.15), [0.4]])
+_WEIGHTS = np.concatenate([np.ones(len(_PLACES)), [3.0], np.full(len(_LIMBS), 0.15), [0.25]])
 _SIZE_NEAR, _SIZE_FAR = 0.45, 0.2  # least sigma of the log of depth over the depth that the apparent size asks for
 _RIVAL = 0.1  # share of the winner's votes that makes a second place worth a look
 _ENOUGH = 3.0  # votes; fewer do not support a place fully, even when all agree
