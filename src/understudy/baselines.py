@@ -32,11 +32,11 @@ if TYPE_CHECKING:
 # --- naive lifting with offsets ---
 
 OFFSETS_M: Final[Mapping[str, float]] = {
-    "nose": 0.003, "neck": 0.117, "shoulder": 0.063, "elbow": 0.061, "wrist": 0.032,
-    "hip": 0.124, "knee": 0.070, "ankle": 0.047, "eye": 0.008, "ear": 0.007,
+    "nose": 0.007, "neck": 0.121, "shoulder": 0.070, "elbow": 0.052, "wrist": 0.029,
+    "hip": 0.124, "knee": 0.074, "ankle": 0.052, "eye": 0.010, "ear": 0.011,
 }  # fmt: skip
 """Kind of joint -> metres along the ray from the surface that naive lifting finds to the joint. Made by
-`python benchmarks/paper_tables.py --fit-offsets --frames 4`: simulated recordings with the training's bodies.
+`python benchmarks/paper_tables.py --fit-offsets --frames 20`: simulated recordings with the training's bodies.
 """
 
 
