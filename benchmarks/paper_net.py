@@ -1,4 +1,4 @@
-"""The paper's network on a CPU: milliseconds per person for both variants, torch eager and OpenVINO, float32.
+"""The paper's network on a CPU: milliseconds per person, torch eager and OpenVINO, float32; the default one beside it.
 
     python benchmarks/paper_net.py
 
@@ -18,11 +18,14 @@ import numpy as np
 import torch
 from common import milliseconds, report
 
+from understudy import runtime
 from understudy.camera import Camera
 from understudy.skeleton import JOINT
 from understudy.types import Keypoints2D
+from understudy.voxelposenet.checkpoint import load_net
 from understudy.voxelposenet.paper_grid import PaperGrid, PaperRoot, network_input, occupancy, volume_peaks
 from understudy.voxelposenet.paper_net import PaperNet
+from understudy.voxelposenet.predictor import weights_path
 from understudy.voxelposenet.tensorflow_weights import VARIANTS
 
 THREADS = 2
@@ -44,12 +47,19 @@ def main() -> None:
         runs[variant, "eager"] = torch_run(net, torch.from_numpy(x))
         runs[variant, "last"] = torch_run(last, torch.from_numpy(x).to(memory_format=torch.channels_last_3d))
         runs[variant, "openvino"], differences[variant] = openvino_run(net, x)
+    runs["default", "openvino"] = default_run()
     times = in_turn(runs)
+    fast = float(np.median(times["paper-fast", "openvino"]))
     rows = []
     for variant in VARIANTS:
         columns = [f"{np.median(t):.0f} ({min(t):.0f})" for (v, _), t in times.items() if v == variant]
         count = sum(p.numel() for p in PaperNet(variant).parameters())
-        rows.append([variant, str(count), *columns, f"{differences[variant]:.0e}"])
+        ratio = fast / float(np.median(times[variant, "openvino"]))
+        rows.append([variant, str(count), *columns, f"{differences[variant]:.0e}", f"{ratio:.1f}"])
+    own = times["default", "openvino"]
+    count = sum(p.numel() for p in load_net(weights_path().with_suffix(".safetensors")).parameters())
+    least_and_median = f"{np.median(own):.1f} ({min(own):.1f})"
+    rows.append(["default", str(count), "", "", least_and_median, "", f"{fast / float(np.median(own)):.1f}"])
     grid = PaperGrid.around(root)
     volumes = np.random.default_rng(0).random((18, 64, 64, 64), np.float32)
     parts = {
@@ -60,7 +70,15 @@ def main() -> None:
     around = "; ".join(f"{name} {milliseconds(work):.2f} ms" for name, work in parts.items())
     report(
         "paper_net",
-        ["variant", "parameters", "torch eager ms", "the same, channels last", "OpenVINO f32 ms", "difference"],
+        [
+            "variant",
+            "parameters",
+            "torch eager ms",
+            "the same, channels last",
+            "OpenVINO f32 ms",
+            "difference",
+            "times as fast as paper-fast",
+        ],
         rows,
         f"One person (batch 1), 64^3 cells, {THREADS} threads: median (least) of {ROUNDS} rounds in each of which "
         f"everything runs once; torch {torch.__version__}, OpenVINO {version('openvino')}. Difference: OpenVINO's "
@@ -90,6 +108,16 @@ def openvino_run(net: PaperNet, x: np.ndarray) -> tuple[Callable[[], object], fl
     got = request.infer([x])
     difference = max(float(np.abs(got[i] - v).max() / v.std()) for i, v in enumerate(expected))
     return lambda: request.infer([x]), difference
+
+
+def default_run() -> Callable[[], object]:
+    """The shipped network on one person, through the runtime that users have."""
+    network = runtime.load(weights_path(), threads=THREADS, outputs=("joints", "spread", "head"))
+    rng = np.random.default_rng(0)
+    depth = rng.uniform(-1.2, 1.2, (1, 2, 64, 64)).astype(np.float32)
+    keypoints = rng.uniform(-0.8, 0.8, (1, 18, 3)).astype(np.float32)
+    distance = np.full((1, 1), 2.5, np.float32)
+    return lambda: network(depth=depth, keypoints=keypoints, root_z=distance)
 
 
 def in_turn(runs: dict[tuple[str, str], Callable[[], object]]) -> dict[tuple[str, str], list[float]]:

@@ -194,7 +194,7 @@ def test_a_root_without_depth_is_judged_by_size():
     yes = torch.ones(4000, 18, dtype=torch.bool)
     spread = [float(view.draw_root(Draw(3), joints, yes, measured)[1].std()) for measured in (yes, ~yes)]
     assert spread[0] < 0.12
-    assert spread[1] == pytest.approx(0.32, rel=0.1)
+    assert spread[1] == pytest.approx(0.48, rel=0.1)
 
 
 def test_batches_are_what_the_network_takes(bank):

@@ -10,7 +10,7 @@ from understudy.skeleton import TORSO
 from understudy.synthetic.draw import Draw
 from understudy.voxels import CELL, CELLS, EMPTY, HALF, LIMIT
 
-_SIZE_SIGMA = 0.08  # relative error of a distance that is judged by a person's size
+_SIZE_SIGMA = 0.12  # relative error of a distance that is judged by a person's size, see understudy.apparent_size
 _NEAREST_Z = 0.1  # metres: nothing nearer to the camera is measured
 
 
