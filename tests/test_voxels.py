@@ -113,6 +113,27 @@ def test_depth_grid_does_not_count(camera: Camera):
     np.testing.assert_allclose(fine[middle], rough[middle], atol=0.02)
 
 
+def test_points_at_the_very_side_of_the_grid():
+    """In single precision, some that are just inside divide to just outside."""
+    view = PersonView.towards(np.array([0.0, 0.0, 2.0]))
+    z = np.linspace(1.2, 3.0, 20_001, dtype=np.float32)
+    edge = np.nextafter(z * np.float32(CELLS // 2), np.float32(0)) / np.float32(2.0 / CELL)
+    for x, y in ((edge, 0 * z), (0 * z, edge), (edge, edge), (-edge, -edge)):
+        near, _ = view.depth_grid(np.stack([x, y, z], 1))
+        assert (near < EMPTY).any()
+
+
+def test_enough_points_are_spread_over_the_frame():
+    camera = Camera(200, 100, np.array([[150.0, 0, 99.5], [0, 150.0, 49.5], [0, 0, 1]]))
+    depth = RegisteredDepth(np.full((100, 200), 2.0, np.float32), camera)
+    every = cloud(depth)
+    assert len(cloud(depth, 20_000)) == len(cloud(depth, 14_000)) == len(every) == 20_000
+    some = cloud(depth, 5000)
+    assert len(some) == 5000
+    assert np.array_equal(some, every[::4])
+    assert len(cloud(RegisteredDepth(np.zeros((100, 200), np.float32), camera), 5000)) == 0
+
+
 def test_cloud_has_every_measured_point(camera: Camera):
     z = np.zeros((540, 960), np.float32)
     z[10, 20], z[500, 900] = 1.5, 3.0

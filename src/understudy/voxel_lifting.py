@@ -15,9 +15,12 @@ from understudy import voxels
 from understudy.assembly import ASSEMBLIES, Rows
 from understudy.errors import UnderstudyError, one_of
 from understudy.roots import Root, find_roots
+from understudy.skeleton import TORSO
 from understudy.types import INFERRED, OBSERVED, Keypoints2D, Person, RegisteredFrame
 from understudy.voxelposenet.predictor import Prediction, Predictor, keypoint_input
 from understudy.voxels import PersonView
+
+_CROWDED = 0.25  # metres: trunks of two people are hardly ever as near as that
 
 
 class VoxelLifter:
@@ -38,11 +41,10 @@ class VoxelLifter:
         each = [(person, root) for person, several in zip(people, roots, strict=True) for root in several]
         lifted = iter(self._lift(frame, each))
         candidates = [[next(lifted) for _ in r] for r in roots]
+        chosen = _chosen(candidates, roots)
         return [
-            several[int(np.argmax([_credibility(p, r) for p, r in zip(several, found, strict=True)]))]
-            if several
-            else Person.failure(person, "no usable 2D keypoint")
-            for person, several, found in zip(people, candidates, roots, strict=True)
+            Person.failure(person, "no usable 2D keypoint") if k is None else several[k]
+            for person, several, k in zip(people, candidates, chosen, strict=True)
         ]
 
     def _lift(self, frame: RegisteredFrame, each: Sequence[tuple[Keypoints2D, Root]]) -> list[Person]:
@@ -50,7 +52,7 @@ class VoxelLifter:
         if not each:
             return []
         views = [PersonView.towards(root.point) for _, root in each]
-        cloud = voxels.cloud(frame.depth)
+        cloud = voxels.cloud(frame.depth, voxels.ENOUGH)
         depth = np.stack([view.depth_grid(cloud) for view in views])
         rows = np.stack(
             [keypoint_input(v, frame.camera, p, self.min_score) for v, (p, _) in zip(views, each, strict=True)]
@@ -63,6 +65,22 @@ class VoxelLifter:
         observed = (said.seen > 0.5) & (rows[:, 2] > 0) & (root.evidence == "depth")
         source = np.where(observed, OBSERVED, INFERRED)
         return Person(seen, joints, said.confidence, said.sigma, tuple(source.tolist()))
+
+
+def _chosen(candidates: Sequence[Sequence[Person]], roots: Sequence[Sequence[Root]]) -> list[int | None]:
+    """Number of the place that each person gets; None for those without any. The surest choose first: what stands
+    where somebody stands already is less likely to be a second person than the one before whom the first stands.
+    """
+    trust = [[_credibility(p, r) for p, r in zip(*pair, strict=True)] for pair in zip(candidates, roots, strict=True)]
+    out: list[int | None] = [None] * len(candidates)
+    taken: list[np.ndarray] = []
+    for i in sorted((i for i, t in enumerate(trust) if t), key=lambda i: -max(trust[i])):
+        trunks = [p.keypoints[TORSO].mean(0) for p in candidates[i]]
+        crowded = [any(np.linalg.norm(t - other) < _CROWDED for other in taken) for t in trunks]
+        k = int(np.argmax(np.array(trust[i]) - 1.0 * np.array(crowded)))
+        out[i] = k
+        taken.append(trunks[k])
+    return out
 
 
 def _credibility(person: Person, root: Root) -> float:

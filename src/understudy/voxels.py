@@ -30,6 +30,8 @@ LIMIT: Final = 1.4
 """metres: depths before or behind the grid are put here, just outside of it"""
 EMPTY: Final = 2.0
 """stands in a depth grid for a column without any depth"""
+ENOUGH: Final = 110_000
+"""points of a frame, see `cloud`"""
 _NEAREST_Z = 0.1  # metres: nothing nearer to the camera is measured
 
 
@@ -87,7 +89,9 @@ class PersonView:
         x, y = x * scale, y * scale
         inside = np.flatnonzero((z > _NEAREST_Z) & (np.abs(x) < edge) & (np.abs(y) < edge))
         x, y, z = x[inside], y[inside], z[inside]
-        column = (y / z + CELLS // 2).astype(np.int32) * CELLS + (x / z + CELLS // 2).astype(np.int32)
+        # a point just inside the grid may be rounded onto its far side
+        row, column = (np.minimum((p / z + CELLS // 2).astype(np.int32), CELLS - 1) for p in (y, x))
+        column += row * CELLS
         depth = (z - self.root_z).astype(np.float32)
         near = np.full(CELLS * CELLS, EMPTY, np.float32)
         np.minimum.at(near, column, depth.clip(-LIMIT, LIMIT))
@@ -97,11 +101,17 @@ class PersonView:
         return np.stack([near, np.where(far > -EMPTY, far, EMPTY)]).reshape(2, CELLS, CELLS)
 
 
-def cloud(depth: RegisteredDepth) -> Float32[np.ndarray, "n 3"]:
-    """Every measured point of a frame, row by row: colour camera's frame, metres; each axis is contiguous in memory."""
+def cloud(depth: RegisteredDepth, enough: int | None = None) -> Float32[np.ndarray, "n 3"]:
+    """Every measured point of a frame, row by row: colour camera's frame, metres; each axis is contiguous in memory.
+
+    enough: where there are more than one and a half times as many, every second one, or third ..., such that about so
+    many are left. The grid's columns are 4 cm wide: `ENOUGH` leaves several points in each of those of a person.
+    """
     c = depth.camera
     rays = _rays(c.width, c.height, c.K.tobytes(), c.distortion_model, c.distortion)
     pixel = np.flatnonzero(depth.z.ravel() > 0)
+    if enough:
+        pixel = pixel[:: max(1, round(len(pixel) / enough))]
     z = depth.z.ravel()[pixel]
     out = np.empty((3, len(z)), np.float32)
     np.multiply(rays[0, pixel], z, out=out[0])
