@@ -8,9 +8,10 @@ import pytest
 from understudy import methods, recordings
 from understudy.errors import UnderstudyError
 from understudy.registration import register
+from understudy.roots import Root
 from understudy.skeleton import JOINT
-from understudy.types import Keypoints2D, RegisteredDepth, RegisteredFrame
-from understudy.voxel_lifting import VoxelLifter
+from understudy.types import Keypoints2D, Person, RegisteredDepth, RegisteredFrame
+from understudy.voxel_lifting import VoxelLifter, choose
 
 
 @pytest.fixture(scope="module")
@@ -65,6 +66,38 @@ def test_something_before_the_trunk_does_not_take_the_root(scene):
     assert np.median(error(person, truth[1])) < 0.2
     neck = seen[1].uv[JOINT["neck"]] * frame.depth.scale_to(frame.camera)
     assert z[int(neck[1]), int(neck[0])] == np.float32(0.5)
+
+
+def at(z: float, confidence: float, support: float) -> tuple[Person, Root]:
+    """Somebody whom the network puts at distance z, and the place that it was shown."""
+    joints = np.zeros((18, 3)) + (0.0, 0.0, z)
+    nothing = Keypoints2D(np.zeros((18, 2)), np.zeros(18))
+    person = Person(nothing, joints, np.full(18, confidence), np.full(18, 0.1), ("observed",) * 18)
+    return person, Root(np.array([0.0, 0.0, z]), support, "depth")
+
+
+def places(*several: tuple[Person, Root]) -> tuple[list[Person], list[Root]]:
+    people, roots = zip(*several, strict=True)
+    return list(people), list(roots)
+
+
+def chosen(*everybody: tuple[list[Person], list[Root]]) -> list[int | None]:
+    return choose([people for people, _ in everybody], [roots for _, roots in everybody])
+
+
+def test_of_two_places_the_network_and_the_depths_decide():
+    assert chosen(places(at(2, 0.9, 0.4), at(3, 0.5, 0.4))) == [0]
+    assert chosen(places(at(2, 0.6, 0.1), at(3, 0.6, 0.8))) == [1]
+    assert chosen(places(at(2, 0.9, 0.2), at(3, 0.5, 0.8))) == [0]  # the network's word weighs more
+    assert chosen(([], []), places(at(2, 0.1, 0.0))) == [None, 0]
+
+
+def test_two_people_do_not_get_one_place():
+    sure = places(at(2, 0.9, 0.9))
+    torn = places(at(2.1, 0.62, 0.3), at(3, 0.6, 0.3))
+    assert chosen(torn) == [0]
+    assert chosen(torn, sure) == [1, 0] and chosen(sure, torn) == [0, 1]
+    assert chosen(places(at(2.1, 0.6, 0.3)), sure) == [0, 0]  # there is no other
 
 
 def test_nobody_and_nothing(scene):

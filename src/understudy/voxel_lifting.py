@@ -41,7 +41,7 @@ class VoxelLifter:
         each = [(person, root) for person, several in zip(people, roots, strict=True) for root in several]
         lifted = iter(self._lift(frame, each))
         candidates = [[next(lifted) for _ in r] for r in roots]
-        chosen = _chosen(candidates, roots)
+        chosen = choose(candidates, roots)
         return [
             Person.failure(person, "no usable 2D keypoint") if k is None else several[k]
             for person, several, k in zip(people, candidates, chosen, strict=True)
@@ -67,7 +67,7 @@ class VoxelLifter:
         return Person(seen, joints, said.confidence, said.sigma, tuple(source.tolist()))
 
 
-def _chosen(candidates: Sequence[Sequence[Person]], roots: Sequence[Sequence[Root]]) -> list[int | None]:
+def choose(candidates: Sequence[Sequence[Person]], roots: Sequence[Sequence[Root]]) -> list[int | None]:
     """Number of the place that each person gets; None for those without any. The surest choose first: what stands
     where somebody stands already is less likely to be a second person than the one before whom the first stands.
     """
