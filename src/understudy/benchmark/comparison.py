@@ -171,12 +171,9 @@ def _lift(
     for index in dict.fromkeys(subjects.frame.tolist()):
         frame = register(recording.frame(index))
         here = np.flatnonzero(subjects.frame == index)
-        for name, lifter in lifters.items():  # all qualities at once: each person is lifted by themselves
-            keys = [key for key in out if key[1] == name]
-            seen = [Keypoints2D.from_rows(row) for quality, _ in keys for row in rows[quality][here]]
-            people = lifter.lift(frame, seen)
-            for k, key in enumerate(keys):
-                _fill(out[key], here, people[k * len(here) : (k + 1) * len(here)])
+        for (quality, name), lifted in out.items():
+            seen = [Keypoints2D.from_rows(row) for row in rows[quality][here]]
+            _fill(lifted, here, lifters[name].lift(frame, seen))
     return out
 
 
