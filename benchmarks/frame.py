@@ -31,7 +31,7 @@ def main() -> None:
     stages = {
         "1 register": milliseconds(lambda: estimator.register(frame)),
         "2 detect": milliseconds(lambda: estimator.detect(registered), 15),
-        "3 lift (naive)": milliseconds(lambda: estimator.lift(registered, keypoints)),
+        "3 lift": milliseconds(lambda: estimator.lift(registered, keypoints)),
     }
     total = milliseconds(lambda: estimator.estimate(frame), 15)
     others = {
@@ -43,7 +43,7 @@ def main() -> None:
     rows = [[name, f"{ms:.1f}", f"{ms / n:.1f}", ""] for name, ms in stages.items()]
     rows.append(["**all**", f"**{total:.1f}**", f"**{total / n:.1f}**", ""])
     for name, ms in others.items():
-        ratio = ms / stages[against.get(name, "3 lift (naive)")]
+        ratio = ms / stages[against.get(name, "3 lift")]
         rows.append([name, f"{ms:.1f}", f"{ms / n:.1f}", f"{ratio:.1f} x ours"])
     heads = ["stage", "ms", "ms per person", "alternative"]
     note = f"{recording.name}: {len(keypoints)} people, colour {registered.camera.width} x {registered.camera.height}."
