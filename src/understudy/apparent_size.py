@@ -6,6 +6,7 @@ from typing import Final
 
 import numpy as np
 from jaxtyping import Float
+from scipy.special import softmax
 
 from understudy.skeleton import JOINT
 
@@ -63,7 +64,6 @@ def distance_of_size(ray: Float[np.ndarray, "18 2"]) -> tuple[float, float] | No
     density = np.exp(np.where(off > 0, -0.5 * (off / _ABOVE[ok, None]) ** 2, off / _BELOW[ok, None]))
     density /= _NORM[ok, None]
     likely = ok.sum() ** _POWER * np.log(0.97 * density + _WRONG).sum(0)
-    share = np.exp(likely - likely.max())
-    share /= share.sum()
+    share = softmax(likely)
     mean = (share * _GRID).sum()
     return float(np.exp(mean)), float(np.sqrt((share * (_GRID - mean) ** 2).sum()))

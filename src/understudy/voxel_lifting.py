@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from scipy.special import logit
 
 from understudy import voxels
 from understudy.assembly import ASSEMBLIES, Rows
@@ -20,6 +21,7 @@ from understudy.types import INFERRED, OBSERVED, Keypoints2D, Person, Registered
 from understudy.voxelposenet.predictor import Prediction, Predictor, keypoint_input
 from understudy.voxels import PersonView
 
+_CROWDING = 1.0  # log odds that a place loses because somebody stands there already
 _CROWDED = 0.25  # metres: trunks of two people are hardly ever as near as that
 
 
@@ -77,7 +79,7 @@ def choose(candidates: Sequence[Sequence[Person]], roots: Sequence[Sequence[Root
     for i in sorted((i for i, t in enumerate(trust) if t), key=lambda i: -max(trust[i])):
         trunks = [p.keypoints[TORSO].mean(0) for p in candidates[i]]
         crowded = [any(np.linalg.norm(t - other) < _CROWDED for other in taken) for t in trunks]
-        k = int(np.argmax(np.array(trust[i]) - 1.0 * np.array(crowded)))
+        k = int(np.argmax(np.array(trust[i]) - _CROWDING * np.array(crowded)))
         out[i] = k
         taken.append(trunks[k])
     return out
@@ -89,4 +91,4 @@ def _credibility(person: Person, root: Root) -> float:
     The latter decide where the network is of two minds; their weight matters little between 0.2 and 0.5.
     """
     sure = np.clip(person.confidence.mean(), 0.01, 0.99)
-    return float(np.log(sure / (1 - sure)) + 0.2 * np.log(root.support + 0.03))
+    return float(logit(sure) + 0.2 * np.log(root.support + 0.03))
