@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from understudy import recordings
 from understudy.detectors import Detector, create
 from understudy.detectors.blazepose import Candidate, Sighting, distinct, merge_duplicates
-from understudy.detectors.blazepose_nets import _ANCHORS, _MIRROR, Region, _refine, _weighted_suppression
+from understudy.detectors.blazepose_nets import _ANCHORS, _MIRROR, Region, _refine, weighted_suppression
 from understudy.registration import register
 from understudy.skeleton import JOINT, N_JOINTS, rows
 from understudy.types import Keypoints2D
@@ -53,11 +53,11 @@ def test_suppression_merges_by_score():
     corners = np.array([[0, 0, 1, 1], [0.1, 0, 1.1, 1], [5, 5, 6, 6.0]])
     keypoints = np.zeros((3, 4, 2))
     keypoints[0], keypoints[1], keypoints[2] = 10, 20, 50
-    out = _weighted_suppression(np.array([0.6, 0.9, 0.8]), corners, keypoints)
+    out = weighted_suppression(np.array([0.6, 0.9, 0.8]), corners, keypoints)
     np.testing.assert_allclose(out[:, 0], [0.9, 0.8])
     np.testing.assert_allclose(out[0, 1:], (0.6 * 10 + 0.9 * 20) / 1.5)
     np.testing.assert_allclose(out[1, 1:], 50)
-    assert _weighted_suppression(np.zeros(0), np.zeros((0, 4)), np.zeros((0, 4, 2))).shape == (0, 9)
+    assert weighted_suppression(np.zeros(0), np.zeros((0, 4)), np.zeros((0, 4, 2))).shape == (0, 9)
 
 
 def test_refinement_finds_the_blob():

@@ -86,6 +86,22 @@ MODELS: Final = MappingProxyType(
                 "Apache-2.0",
                 "keypoints of one person (detector blazepose)",
             ),
+            ModelFile(
+                "palm_detection_full",
+                "mediapipe/modules/palm_detection/palm_detection_full.tflite",
+                2339846,
+                "1b14e9422c6ad006cde6581a46c8b90dd573c07ab7f3934b5589e7cea3f89a54",
+                "Apache-2.0",
+                "finds palms (palm normals)",
+            ),
+            ModelFile(
+                "hand_landmark_full",
+                "mediapipe/modules/hand_landmark/hand_landmark_full.tflite",
+                5478917,
+                "11c272b891e1a99ab034208e23937a8008388cf11ed2a9d776ed3d01d0ba00e3",
+                "Apache-2.0",
+                "joints of one hand (palm normals)",
+            ),
         )
     }
 )

@@ -95,7 +95,7 @@ def _anchors() -> Float[np.ndarray, "2254 2"]:
 _ANCHORS = _anchors()
 
 
-def _sigmoid(x: np.ndarray) -> np.ndarray:
+def sigmoid(x: np.ndarray) -> np.ndarray:
     return 1 / (1 + np.exp(-np.clip(x, -60, 60)))
 
 
@@ -118,13 +118,13 @@ class BlazePoseNets:
 
     def _detect(self, crop: np.ndarray) -> np.ndarray:
         boxes, logits = self._detector(crop[None].astype(np.float32) / 127.5 - 1)
-        score = _sigmoid(logits[0, :, 0])
+        score = sigmoid(logits[0, :, 0])
         keep = np.flatnonzero(score > 0.5)
         raw, anchors = boxes[0, keep].astype(np.float64) / DETECTOR_SIZE, _ANCHORS[keep]
         center, size = raw[:, 0:2] + anchors, raw[:, 2:4]
         corners = np.concatenate([center - size / 2, center + size / 2], axis=1)
         keypoints = raw[:, 4:12].reshape(-1, 4, 2) + anchors[:, None]
-        return _weighted_suppression(score[keep], corners, keypoints * DETECTOR_SIZE - 0.5)
+        return weighted_suppression(score[keep], corners, keypoints * DETECTOR_SIZE - 0.5)
 
     def landmarks(
         self, crops: list[UInt8[np.ndarray, "256 256 3"]], regions: list[Region], mirrored: bool = False
@@ -148,14 +148,14 @@ class BlazePoseNets:
         uv = (xy * LANDMARK_SIZE - 0.5) @ A[:, :2].T + A[:, 2]
         return Landmarks(
             uv=uv[:N_LANDMARKS],
-            visibility=_sigmoid(rows[:N_LANDMARKS, 3]),
-            presence=_sigmoid(rows[:N_LANDMARKS, 4]),
+            visibility=sigmoid(rows[:N_LANDMARKS, 3]),
+            presence=sigmoid(rows[:N_LANDMARKS, 4]),
             score=float(score[0, 0]),
             next_region=Region.from_points(uv[_AUXILIARY[0]], uv[_AUXILIARY[1]]),
         )
 
 
-def _weighted_suppression(score: np.ndarray, corners: np.ndarray, keypoints: np.ndarray) -> np.ndarray:
+def weighted_suppression(score: np.ndarray, corners: np.ndarray, keypoints: np.ndarray) -> np.ndarray:
     """Merges boxes that overlap (IoU > 0.3) into the score-weighted mean of their keypoints, best first."""
     area = np.prod(np.clip(corners[:, 2:] - corners[:, :2], 0, None), axis=1)
     left, out = np.argsort(-score), []
@@ -169,7 +169,7 @@ def _weighted_suppression(score: np.ndarray, corners: np.ndarray, keypoints: np.
         merged = np.average(keypoints[group], axis=0, weights=score[group])
         out.append(np.concatenate([[score[best]], merged.ravel()]))
         left = left[~same]
-    return np.array(out).reshape(-1, 9)
+    return np.array(out).reshape(-1, 1 + 2 * keypoints.shape[1])
 
 
 def _refine(xy: Float[np.ndarray, "39 2"], heatmaps: Float32[np.ndarray, "64 64 39"]) -> Float[np.ndarray, "39 2"]:
@@ -180,7 +180,7 @@ def _refine(xy: Float[np.ndarray, "39 2"], heatmaps: Float32[np.ndarray, "64 64 
     rows, cols = cell[:, 1, None] + offsets, cell[:, 0, None] + offsets
     inside_r, inside_c = (rows >= 0) & (rows < HEATMAP_SIZE), (cols >= 0) & (cols < HEATMAP_SIZE)
     rows, cols = rows.clip(0, HEATMAP_SIZE - 1), cols.clip(0, HEATMAP_SIZE - 1)
-    patch = _sigmoid(heatmaps[rows[:, :, None], cols[:, None, :], np.arange(n)[:, None, None]])
+    patch = sigmoid(heatmaps[rows[:, :, None], cols[:, None, :], np.arange(n)[:, None, None]])
     patch = patch * inside_r[:, :, None] * inside_c[:, None, :]
     total = patch.sum((1, 2))
     confident = (patch.max((1, 2)) >= 0.5) & ((cell >= 0) & (cell < HEATMAP_SIZE)).all(1)

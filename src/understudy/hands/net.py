@@ -1,0 +1,114 @@
+"""HandNormalNet (torch): depth around a hand, the arm's and body's joints, the colour path's word -> the palm.
+
+Made for a CPU: a small residual network over 48 x 48 depth, whose features meet those of the joints. A von Mises-Fisher
+distribution for the palm's normal and for the fingers' direction, 21 landmarks, and the chance that the normal is within
+30 degrees. Coordinates are those of the crop view (`understudy.synthetic.hand_samples`); every hand is a right one.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final, NamedTuple
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor, nn
+
+CONTEXT_SIZE: Final = 7
+COLOR_SIZE: Final = 9
+"""Numbers of the colour path: normal, direction, log of the spread, presence, and 1; all zero where it says nothing."""
+WITHIN: Final = math.cos(math.radians(30))
+_KAPPA: Final = (-2.0, 6.0)  # range of the log of the concentration
+
+
+class HandOutput(NamedTuple):
+    """What the network says of each hand."""
+
+    normal: Float[Tensor, "b 3"]
+    """unit, out of the palm"""
+    direction: Float[Tensor, "b 3"]
+    """unit, from the wrist to the middle knuckle"""
+    log_kappa: Float[Tensor, "b 2"]
+    """log of the concentrations of normal and direction"""
+    landmarks: Float[Tensor, "b 21 3"]
+    """relative to the crop's centre, metres"""
+    sure: Float[Tensor, " b"]
+    """logit of 'the normal is within 30 degrees'"""
+
+
+class _Residual(nn.Module):
+    def __init__(self, channels: int):
+        super().__init__()
+        self.a = _conv(channels, channels, 3)
+        self.b = nn.Sequential(nn.Conv2d(channels, channels, 3, padding=1, bias=False), nn.BatchNorm2d(channels))
+
+    def forward(self, x: Tensor) -> Tensor:
+        return F.relu(x + self.b(self.a(x)))
+
+
+def _conv(inputs: int, outputs: int, size: int, stride: int = 1) -> nn.Sequential:
+    layer = nn.Conv2d(inputs, outputs, size, stride=stride, padding=size // 2, bias=False)
+    return nn.Sequential(layer, nn.BatchNorm2d(outputs), nn.ReLU())
+
+
+class HandNormalNet(nn.Module):
+    """See the module's text."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        known = 3 * CONTEXT_SIZE + 1 + COLOR_SIZE
+        self.first = _conv(2, 24, 5, 2)
+        self.down = _conv(24, 48, 3, 2)
+        self.told = nn.Sequential(nn.Linear(known, 128), nn.ReLU(), nn.Linear(128, 128), nn.ReLU())
+        self.bias = nn.Linear(128, 48)
+        self.middle = nn.Sequential(_Residual(48), _conv(48, 96, 3, 2), _Residual(96), _Residual(96))
+        self.squeeze = _conv(96, 32, 1)
+        self.join = nn.Sequential(nn.Linear(32 * 36 + 96 + 128, 256), nn.ReLU(), nn.Linear(256, 192), nn.ReLU())
+        self.read = nn.Linear(192, 3 + 3 + 2 + 63)
+        self.judge = nn.Sequential(nn.Linear(192 + 2, 48), nn.ReLU(), nn.Linear(48, 1))
+
+    def forward(
+        self,
+        depth: Float[Tensor, "b 2 48 48"],
+        context: Float[Tensor, "b 7 3"],
+        distance: Float[Tensor, "b 1"],
+        color: Float[Tensor, "b 9"],
+    ) -> HandOutput:
+        """Inputs as `HandBatch` has them. See `HandOutput`."""
+        near, seen = depth[:, :1], depth[:, 1:]
+        told = self.told(torch.cat([context.flatten(1) / 0.3, distance / 3, color], 1))
+        x = self.down(self.first(torch.cat([near * seen / 0.1, seen], 1)))
+        x = self.middle(x + self.bias(told)[:, :, None, None])
+        joined = self.join(torch.cat([self.squeeze(x).flatten(1), x.amax((2, 3)), told], 1))
+        out = self.read(joined)
+        kappa = out[:, 6:8].clamp(*_KAPPA)
+        sure = self.judge(torch.cat([joined, kappa], 1).detach())[:, 0]
+        normal, direction = F.normalize(out[:, :3], dim=1), F.normalize(out[:, 3:6], dim=1)
+        return HandOutput(normal, direction, kappa, 0.1 * out[:, 8:].unflatten(1, (21, 3)), sure)
+
+
+def loss(
+    output: HandOutput,
+    normal: Float[Tensor, "b 3"],
+    direction: Float[Tensor, "b 3"],
+    landmarks: Float[Tensor, "b 21 3"],
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """Negative log likelihoods of both directions, L1 of the landmarks, and the judge's cross-entropy."""
+    cos_n = (output.normal * normal).sum(1)
+    cos_d = (output.direction * direction).sum(1)
+    parts = {
+        "normal": von_mises_fisher(cos_n, output.log_kappa[:, 0]).mean(),
+        "direction": von_mises_fisher(cos_d, output.log_kappa[:, 1]).mean(),
+        "landmarks": (output.landmarks - landmarks).abs().mean() / 0.02,
+        "sure": F.binary_cross_entropy_with_logits(output.sure, (cos_n.detach() > WITHIN).float()),
+    }
+    total = parts["normal"] + 0.5 * parts["direction"] + 0.5 * parts["landmarks"] + parts["sure"]
+    parts["degrees"] = torch.rad2deg(torch.acos(cos_n.detach().clamp(-1, 1))).mean()
+    return total, parts
+
+
+def von_mises_fisher(cos: Float[Tensor, " b"], log_kappa: Float[Tensor, " b"]) -> Float[Tensor, " b"]:
+    """Negative log density on the sphere, up to a constant, at an angle of cosine `cos` from the mean."""
+    kappa = log_kappa.exp()
+    return -log_kappa + torch.log1p(-torch.exp(-2 * kappa)) + kappa * (1 - cos)
