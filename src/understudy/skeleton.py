@@ -83,3 +83,12 @@ def to_coco18(keypoints: Float[np.ndarray, "n 3"], layout: str) -> Float[np.ndar
     out[:, 2] = np.minimum(a[:, 2], b[:, 2])
     out[out[:, 2] <= 0] = 0.0
     return out
+
+
+HAND_KEYPOINTS: Final = (
+    "wrist",
+    *(f"{f}_{k}" for f in ("thumb", "index", "middle", "ring", "pinky") for k in range(1, 5)),
+)
+"""The 21 keypoints of a hand, in MediaPipe's order: the wrist, then three joints and the tip of each finger."""
+HAND_BONES: Final = tuple((a - 1 if a % 4 != 1 else 0, a) for a in range(1, 21))
+"""Pairs of them."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -137,12 +138,59 @@ class Keypoints2D:
 
 @dataclass(frozen=True, eq=False)
 class Palm:
-    """The direction of a palm."""
+    """Which way a palm faces, and the hand around it; colour camera's frame."""
 
     normal: Float[np.ndarray, "3"]
-    """unit vector out of the palm, colour camera's frame"""
+    """unit vector out of the palm"""
     confidence: float
     """probability that the normal is within 30 degrees of the truth"""
+    direction: Float[np.ndarray, "3"] | None = None
+    """unit vector from the wrist to the middle finger's knuckle"""
+    keypoints: Float[np.ndarray, "21 3"] | None = None
+    """metres, in the order of `skeleton.HAND_KEYPOINTS`; NaN rows where no measurement supports them"""
+    keypoints_2d: Float[np.ndarray, "21 3"] | None = None
+    """u, v (colour pixels), score in [0, 1]"""
+
+    def __post_init__(self) -> None:
+        assert self.normal.shape == (3,)
+        assert self.direction is None or self.direction.shape == (3,)
+
+    @property
+    def R_cam_hand(self) -> Float[np.ndarray, "3 3"] | None:
+        """Rotation of the hand frame: z out of the palm, x towards the fingers, y = z x x; None without a direction.
+
+        The same for both hands: a right hand's thumb is at -y, a left one's at +y.
+        """
+        if self.direction is None:
+            return None
+        across = np.cross(self.normal, self.direction)
+        length = np.linalg.norm(across)
+        if length < 1e-6:  # the two are parallel
+            return None
+        y = across / length
+        return np.column_stack([np.cross(y, self.normal), y, self.normal])
+
+
+@dataclass(frozen=True, eq=False)
+class Hands(Mapping[str, "Palm | None"]):
+    """A person's palms: a mapping from 'left' and 'right'."""
+
+    left: Palm | None = None
+    right: Palm | None = None
+    why: Mapping[str, str] = field(default_factory=dict)
+    """side -> why there is no palm; empty where hands were not looked at"""
+
+    def __getitem__(self, side: str) -> Palm | None:
+        if side not in ("left", "right"):
+            raise KeyError(side)
+        palm: Palm | None = getattr(self, side)
+        return palm
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(("left", "right"))
+
+    def __len__(self) -> int:
+        return 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,7 +208,7 @@ class Person:
     """per joint: observed, inferred or missing"""
     id: int = 0
     """stays with the person through a recording"""
-    hands: dict[str, Palm | None] = field(default_factory=lambda: {"left": None, "right": None})
+    hands: Mapping[str, Palm | None] = field(default_factory=Hands)
     failed: str | None = None
     """why a detected person has no 3D keypoints at all; None when there are some"""
 

@@ -1,7 +1,7 @@
 """Hands in detail: dense surfaces of anny's hands with articulated fingers, for images that a hand fills.
 
-Hand frame: origin at the wrist, x towards the middle finger's knuckle, z out of the palm, y = z x x. All hands are right
-hands (the thumb is at -y); a left hand is the mirror image, y -> -y. Metres.
+Hand frame: origin at the wrist, x towards the middle finger's knuckle, z out of the palm, y = z x x. All hands are
+right hands (the thumb is at -y); a left hand is the mirror image, y -> -y. Metres.
 """
 
 from __future__ import annotations
@@ -76,8 +76,8 @@ def articulate(
 ) -> PosedHands:
     """Bends fingers.
 
-    ids: which hands. flex: radians of each joint, thumb to pinky, from the knuckle outwards; 0 = as at rest. spread: about
-    the palm's normal, away from the palm's middle towards the thumb.
+    ids: which hands. flex: radians of each joint, thumb to pinky, from the knuckle outwards; 0 = as at rest. spread:
+    about the palm's normal, away from the palm's middle towards the thumb.
     """
     heads, axis = bank.heads[ids], bank.flexion[ids]
     b, device = len(ids), bank.device
@@ -210,9 +210,7 @@ def _bone(model: Any, heads: Tensor, name: str) -> Tensor:
 
 def _frames(model: Any, heads: Tensor) -> tuple[Float[Tensor, "n 3 3"], Float[Tensor, "n 3"]]:
     """Columns: the hand frame's axes in the body frame; and the wrist."""
-    wrist, index, middle, pinky = (
-        _bone(model, heads, b) for b in ("wrist", "finger2-1", "finger3-1", "finger5-1")
-    )
+    wrist, index, middle, pinky = (_bone(model, heads, b) for b in ("wrist", "finger2-1", "finger3-1", "finger5-1"))
     normal = unit(cross(index - wrist, pinky - wrist))
     return axes(middle - wrist, normal), wrist
 

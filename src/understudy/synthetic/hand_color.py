@@ -1,8 +1,8 @@
 """What the colour path says of simulated hands: the errors that it was measured to have on rendered ones.
 
-Measured on 650 crops of 66 rendered hands (tools/make_rooms and the bundled recording, BlazePose's hand networks): hands that
-are hidden, small or seen edge-on are missed or turned by half a turn; the others are off by 12 degrees along each axis,
-mostly the same way in all crops of one hand.
+Measured on 650 crops of 66 rendered hands (tools/make_rooms and the bundled recording, BlazePose's hand networks):
+hands that are hidden, small or seen edge-on are missed or turned by half a turn; the others are off by 12 degrees along
+each axis, mostly the same way in all crops of one hand.
 """
 
 from __future__ import annotations
