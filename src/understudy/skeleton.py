@@ -85,10 +85,9 @@ def to_coco18(keypoints: Float[np.ndarray, "n 3"], layout: str) -> Float[np.ndar
     return out
 
 
-HAND_KEYPOINTS: Final = (
-    "wrist",
-    *(f"{f}_{k}" for f in ("thumb", "index", "middle", "ring", "pinky") for k in range(1, 5)),
-)
+_FINGERS = ("thumb", "index", "middle", "ring", "pinky")
+HAND_KEYPOINTS: Final = ("wrist", *(f"{finger}_{k}" for finger in _FINGERS for k in range(1, 5)))
 """The 21 keypoints of a hand, in MediaPipe's order: the wrist, then three joints and the tip of each finger."""
+
 HAND_BONES: Final = tuple((a - 1 if a % 4 != 1 else 0, a) for a in range(1, 21))
-"""Pairs of them."""
+"""Pairs of rows of `HAND_KEYPOINTS`: from the wrist along each finger."""

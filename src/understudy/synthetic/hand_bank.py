@@ -19,13 +19,12 @@ from torch import Tensor
 from understudy.assets import cache_dir
 from understudy.errors import UnderstudyError
 from understudy.files import write_atomically
+from understudy.skeleton import HAND_KEYPOINTS
 from understudy.synthetic.kinematics import axes, cross, unit
 
 FINGERS: Final = ("thumb", "index", "middle", "ring", "pinky")
 PARTS: Final = ("palm", *(f"{finger}_{k}" for finger in FINGERS for k in (1, 2, 3)))
 """What moves as one: the palm with the forearm's end, then three bones of each finger, from the knuckle outwards."""
-LANDMARKS: Final = ("wrist", *(f"{finger}_{k}" for finger in FINGERS for k in (1, 2, 3, 4)))
-"""The 21 hand keypoints in MediaPipe's order: wrist, then three joints and the tip of each finger."""
 VERSION: Final = 1
 
 _FOREARM = 0.14  # metres of the forearm that come along
@@ -115,7 +114,7 @@ def about(axis: Float[Tensor, "b 3"], angle: Float[Tensor, " b"]) -> Float[Tenso
 
 def palm_normals(landmarks: Float[Tensor, "b 21 3"]) -> Float[Tensor, "b 3"]:
     """Unit normals out of the palms of right hands: wrist to index knuckle, times wrist to pinky knuckle."""
-    wrist, index, pinky = (landmarks[:, LANDMARKS.index(n)] for n in ("wrist", "index_1", "pinky_1"))
+    wrist, index, pinky = (landmarks[:, HAND_KEYPOINTS.index(n)] for n in ("wrist", "index_1", "pinky_1"))
     return unit(cross(index - wrist, pinky - wrist))
 
 
