@@ -16,6 +16,7 @@ from jaxtyping import Float, Float32, UInt8
 
 from understudy.camera import Camera
 from understudy.drawing import OUTLINE, WHITE, Box, Canvas, Rgb
+from understudy.hand_overlay import HandFigure
 from understudy.skeleton import BONES, FACE, JOINT, JOINTS, TORSO
 from understudy.types import INFERRED, MISSING, Person, RegisteredFrame
 
@@ -27,8 +28,6 @@ PALETTE: Final = (
 NO_DEPTH: Final = (38, 38, 42)
 LOW_SCORE: Final = 0.5
 """below this 2D score a joint and its bones are thin and faint"""
-PALM_ARROW_M: Final = 0.15
-"""length of a palm normal's arrow, metres"""
 
 _LEFT = np.array([name.startswith("left_") for name in JOINTS])
 
@@ -77,17 +76,18 @@ def draw_people(
     """A copy of the RGB image with the people drawn on it; far people first. `camera` is the image's."""
     canvas = Canvas(color.copy(order="C"))
     figures = sorted((_Figure.of(p, camera) for p in people), key=lambda f: -f.distance)
-    faint = [f for f in figures if f.weak.any()]
+    faint = [f for f in figures if f.weak.any() or any(h.weak for h in f.hands)]
     if faint:
         layer = Canvas(canvas.image.copy())
         for figure in faint:
             figure.draw_bones(layer, weak=True)
+            figure.draw_palms(layer, weak=True)
         cv2.addWeighted(canvas.image, 0.4, layer.image, 0.6, 0, dst=canvas.image)
     for figure in figures:
         figure.draw_bones(canvas, weak=False)
         figure.draw_detections(canvas)
         figure.draw_joints(canvas)
-        figure.draw_palms(canvas, camera)
+        figure.draw_palms(canvas, weak=False)
     taken: list[Box] = []
     for figure in reversed(figures):  # the nearest person's label gets its place first
         if figure.head is not None:
@@ -116,6 +116,7 @@ class _Figure:
     """diagonal of the joints' box, pixels"""
     distance: float
     """metres"""
+    hands: tuple[HandFigure, ...]
 
     @classmethod
     def of(cls, person: Person, camera: Camera) -> _Figure:
@@ -129,15 +130,21 @@ class _Figure:
         known = uv[np.isfinite(uv).all(axis=1)]
         size = float(np.linalg.norm(np.ptp(known, axis=0))) if len(known) else 0.0
         largest = max(1, min(camera.width, camera.height) // 100)
+        color, thickness = person_color(person.id), int(np.clip(round(size / 90), 1, largest))
+        hands = (
+            HandFigure.of(person, side, camera, joint_color(JOINT[f"{side}_wrist"], color), thickness)
+            for side in ("left", "right")
+        )
         return cls(
             person,
             uv,
             only_2d,
             k2d.score < LOW_SCORE,
-            person_color(person.id),
-            int(np.clip(round(size / 90), 1, largest)),
+            color,
+            thickness,
             size,
             torso_distance(person) or np.inf,
+            tuple(hand for hand in hands if hand is not None),
         )
 
     @property
@@ -184,15 +191,11 @@ class _Figure:
             canvas.line(self.uv[row], at, WHITE, 1)
             canvas.outlined_disc(at, max(0.8, 0.3 * self.thickness), WHITE)
 
-    def draw_palms(self, canvas: Canvas, camera: Camera) -> None:
-        """Arrows out of the palms, from the wrists."""
-        for side, palm in self.person.hands.items():
-            wrist = self.person.keypoints[JOINT[f"{side}_wrist"]]
-            if palm is None or np.isnan(wrist).any():
-                continue
-            ends = camera.project(np.stack([wrist, wrist + PALM_ARROW_M * palm.normal]))
-            if np.isfinite(ends).all() and np.abs(ends).max() < 1e5:
-                canvas.arrow(ends[0], ends[1], WHITE, max(1, self.thickness // 2))
+    def draw_palms(self, canvas: Canvas, *, weak: bool) -> None:
+        """Hands, and arrows out of the palms: the doubtful ones, or the others."""
+        for hand in (h for h in self.hands if h.weak == weak):
+            hand.draw_bones(canvas)
+            hand.draw_palm(canvas)
 
 
 def _draw_legend(canvas: Canvas) -> None:

@@ -4,19 +4,24 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
-from understudy.errors import RecordingError
+from understudy.errors import RecordingError, one_of
 from understudy.files import read_json, write_atomically
-from understudy.skeleton import N_JOINTS
-from understudy.types import INFERRED, MISSING, OBSERVED, Keypoints2D, Palm, Person
+from understudy.skeleton import HAND_KEYPOINTS, N_JOINTS
+from understudy.types import INFERRED, MISSING, OBSERVED, Hands, Keypoints2D, Palm, Person
 
 FORMAT = "people/1"
+
+_SIDES = ("left", "right")
+_ROUNDED = 1e-5  # of a unit vector's length: what 5 digits may do to it
 
 
 @dataclass(frozen=True)
@@ -101,15 +106,23 @@ def _person_to_json(person: Person) -> dict[str, Any]:
         out["sigma_m"] = [None if math.isnan(s) else round(float(s), 4) for s in person.sigma_m]
         out["source"] = list(person.source)
     out["keypoints_2d"] = [[round(float(x), 3) for x in row] for row in person.keypoints_2d.rows()]
-    out["hands"] = {
-        side: None
-        if palm is None
-        else {
-            "normal": [round(float(x), 5) for x in palm.normal],
-            "confidence": round(float(palm.confidence), 4),
-        }
-        for side, palm in person.hands.items()
+    out["hands"] = {side: None if palm is None else _palm_to_json(palm) for side, palm in person.hands.items()}
+    if isinstance(person.hands, Hands) and person.hands.why:
+        out["hands_missing"] = dict(person.hands.why)
+    return out
+
+
+def _palm_to_json(palm: Palm) -> dict[str, Any]:
+    out: dict[str, Any] = {
+        "normal": [round(float(x), 5) for x in palm.normal],
+        "confidence": round(float(palm.confidence), 4),
     }
+    if palm.direction is not None:
+        out["direction"] = [round(float(x), 5) for x in palm.direction]
+    if palm.keypoints is not None:
+        out["keypoints"] = rows_to_json(palm.keypoints, 4)
+    if palm.keypoints_2d is not None:
+        out["keypoints_2d"] = [row or [0.0, 0.0, 0.0] for row in rows_to_json(palm.keypoints_2d, 3)]
     return out
 
 
@@ -121,15 +134,12 @@ def _person_from_json(data: Any, where: str) -> Person:
     id = data.get("id", 0)
     if not isinstance(id, int) or isinstance(id, bool) or id < 0:
         raise RecordingError(f"{where}.id: must be a whole number, got {id!r}")
-    palms = data.get("hands") or {}
-    if not isinstance(palms, Mapping):
-        raise RecordingError(f"{where}.hands: must be an object")
+    hands = _hands_from_json(data, where)
     if "failed" in data:
-        return Person.failure(keypoints_2d, str(data["failed"])).with_id(id)
+        return replace(Person.failure(keypoints_2d, str(data["failed"])), id=id, hands=hands)
     source = data.get("source")
     if not isinstance(source, list) or len(source) != N_JOINTS or not set(source) <= {OBSERVED, INFERRED, MISSING}:
         raise RecordingError(f"{where}.source: must be 18 of {OBSERVED}, {INFERRED}, {MISSING}")
-    hands = {side: _palm_from_json(palms.get(side), f"{where}.hands.{side}") for side in ("left", "right")}
     return Person(
         keypoints_2d,
         rows_from_json(data.get("keypoints"), 3, f"{where}.keypoints"),
@@ -141,29 +151,78 @@ def _person_from_json(data: Any, where: str) -> Person:
     )
 
 
+def _hands_from_json(data: Mapping[str, Any], where: str) -> Hands:
+    palms, why = data.get("hands") or {}, data.get("hands_missing")
+    if not isinstance(palms, Mapping):
+        raise RecordingError(f"{where}.hands: must be an object")
+    if why is not None and not isinstance(why, Mapping):
+        raise RecordingError(f"{where}.hands_missing: must be an object")
+    for side, reason in (why or {}).items():
+        if side not in _SIDES:
+            raise RecordingError(f"{where}.hands_missing: {side!r} must be {one_of(_SIDES)}")
+        if not isinstance(reason, str):
+            raise RecordingError(f"{where}.hands_missing.{side}: must be a text, got {reason!r}")
+    left, right = (_palm_from_json(palms.get(side), f"{where}.hands.{side}") for side in _SIDES)
+    return Hands(left, right, dict(why or {}))
+
+
 def _palm_from_json(data: Any, where: str) -> Palm | None:
     if data is None:
         return None
-    try:
-        return Palm(np.array(data["normal"], dtype=np.float64).reshape(3), float(data.get("confidence", 1.0)))
-    except (TypeError, KeyError, ValueError) as e:
-        raise RecordingError(f"{where}: needs a 'normal' of 3 numbers ({e})") from e
+    if not isinstance(data, Mapping):
+        raise RecordingError(f"{where}: must be an object or null")
+    confidence = data.get("confidence", 1.0)
+    if not _is_number(confidence) or not 0 <= confidence <= 1:
+        raise RecordingError(f"{where}.confidence: must be a number in [0, 1], got {confidence!r}")
+    direction, keypoints, seen = (data.get(key) for key in ("direction", "keypoints", "keypoints_2d"))
+    return Palm(
+        _unit_from_json(data.get("normal"), f"{where}.normal"),
+        float(confidence),
+        None if direction is None else _unit_from_json(direction, f"{where}.direction"),
+        None if keypoints is None else _hand_rows(keypoints, f"{where}.keypoints"),
+        None if seen is None else _hand_rows_2d(seen, f"{where}.keypoints_2d"),
+    )
+
+
+def _unit_from_json(data: Any, where: str) -> Float[np.ndarray, "3"]:
+    """A unit vector, at most 1 % off; one that was only rounded stays as it is."""
+    if not isinstance(data, list) or len(data) != 3 or not all(_is_number(x) for x in data):
+        raise RecordingError(f"{where}: must be 3 numbers")
+    length = math.hypot(*data)
+    if not abs(length - 1) <= 0.01:
+        raise RecordingError(f"{where}: must be a unit vector, got {data}")
+    return np.array(data, dtype=np.float64) / (1.0 if abs(length - 1) <= _ROUNDED else length)
+
+
+def _hand_rows(data: Any, where: str) -> Float[np.ndarray, "21 3"]:
+    """A hand's rows; NaN where null."""
+    rows = rows_from_json(data, 3, where, len(HAND_KEYPOINTS))
+    if not np.isfinite(rows[[row is not None for row in data]]).all():
+        raise RecordingError(f"{where}: must be finite; a row without a position is null")
+    return rows
+
+
+def _hand_rows_2d(data: Any, where: str) -> Float[np.ndarray, "21 3"]:
+    """A hand's rows u, v, score; zeros where null."""
+    rows = np.nan_to_num(_hand_rows(data, where))
+    if rows[:, 2].min() < 0 or rows[:, 2].max() > 1:
+        raise RecordingError(f"{where}: scores must lie in [0, 1]")
+    return rows
 
 
 def rows_to_json(rows: np.ndarray, digits: int) -> list[list[float] | None]:
-    """18 x n array -> lists; a row with a NaN becomes null."""
+    """Array of rows -> lists; a row with a NaN becomes null."""
     return [None if np.isnan(r).any() else [round(float(x), digits) for x in r] for r in rows]
 
 
-def rows_from_json(data: Any, n: int, where: str) -> np.ndarray:
-    """18 rows of n numbers (or null -> NaN). Raises RecordingError that names `where`."""
-    if not isinstance(data, Sequence) or len(data) != N_JOINTS:
-        raise RecordingError(f"{where}: must be a list of {N_JOINTS} rows")
+def rows_from_json(data: Any, n: int, where: str, count: int = N_JOINTS) -> np.ndarray:
+    """`count` rows of n numbers (or null -> NaN). Raises RecordingError that names `where`."""
+    if not isinstance(data, Sequence) or len(data) != count:
+        raise RecordingError(f"{where}: must be a list of {count} rows")
     try:
-        return np.array([[np.nan] * n if r is None else [float(x) for x in r] for r in data], dtype=np.float64).reshape(
-            18, n
-        )
-    except (TypeError, ValueError) as e:
+        rows = [[np.nan] * n if r is None else [_number(x) for x in r] for r in data]
+        return np.array(rows, dtype=np.float64).reshape(count, n)
+    except (TypeError, ValueError, OverflowError) as e:
         raise RecordingError(f"{where}: each row must be {n} numbers or null ({e})") from e
 
 
@@ -174,3 +233,14 @@ def _numbers(data: Any, where: str) -> np.ndarray:
         return np.array([np.nan if x is None else float(x) for x in data])
     except (TypeError, ValueError) as e:
         raise RecordingError(f"{where}: must be numbers ({e})") from e
+
+
+def _is_number(x: Any) -> bool:
+    """Whether JSON has a number there that a float can hold."""
+    return isinstance(x, int | float) and not isinstance(x, bool) and abs(x) <= sys.float_info.max
+
+
+def _number(x: Any) -> float:
+    if isinstance(x, bool | str):
+        raise TypeError(f"{x!r} is not a number")
+    return float(x)

@@ -107,8 +107,7 @@ def cloud(depth: RegisteredDepth, enough: int | None = None) -> Float32[np.ndarr
     enough: where there are more than one and a half times as many, every second one, or third ..., such that about so
     many are left. The grid's columns are 4 cm wide: `ENOUGH` leaves several points in each of those of a person.
     """
-    c = depth.camera
-    rays = _rays(c.width, c.height, c.K.tobytes(), c.distortion_model, c.distortion)
+    rays = pixel_rays(depth.camera).reshape(2, -1)
     pixel = np.flatnonzero(depth.z.ravel() > 0)
     if enough:
         pixel = pixel[:: max(1, round(len(pixel) / enough))]
@@ -118,6 +117,12 @@ def cloud(depth: RegisteredDepth, enough: int | None = None) -> Float32[np.ndarr
     np.multiply(rays[1, pixel], z, out=out[1])
     out[2] = z
     return out.T
+
+
+def pixel_rays(camera: Camera) -> Float32[np.ndarray, "2 h w"]:
+    """X/Z and Y/Z of every pixel of a camera; computed once."""
+    rays = _rays(camera.width, camera.height, camera.K.tobytes(), camera.distortion_model, camera.distortion)
+    return rays.reshape(2, camera.height, camera.width)
 
 
 @lru_cache(maxsize=4)

@@ -11,6 +11,7 @@ from typing import Final
 
 import numpy as np
 from jaxtyping import Float
+from scipy.special import expit
 
 from understudy.apparent_size import distance_of_size
 from understudy.camera import Camera
@@ -38,6 +39,7 @@ _REACH = 0.11  # metres: farthest that a hand's wrist is from the body's
 _LIMBS = {("shoulder", "elbow"): 0.28, ("elbow", "wrist"): 0.25, ("hip", "knee"): 0.40, ("knee", "ankle"): 0.40}
 _SCALES = (0.6, 1.15)  # of bodies
 _SHORT = 0.3  # a forearm that looks shorter than this share of its length has no direction in the image
+_HAND = 0.19  # metres: an adult's hand
 _SCORE = 0.2  # least score of a 2D keypoint that is used
 _TOGETHER = np.radians(60)  # crops that agree
 
@@ -62,6 +64,15 @@ class ColorPalm:
     """fraction of the crops in which the hand was found and that agree"""
     side_probability: float
     """what the network gives the side (left or right) that the body says; evidence only"""
+    pixels: float
+    """of an adult's hand at this place"""
+
+    @property
+    def quality(self) -> float:
+        """About the probability that the normal is within 30 degrees; a logistic fit to rendered hands."""
+        size, spread = np.log(self.pixels / 40), np.log(np.degrees(self.spread) / 10 + 0.1)
+        word = 2.85 * self.presence + 2.05 * self.share + 3.06 * self.side_probability
+        return float(expit(-5.17 + 0.52 * size - 0.28 * spread + word))
 
 
 @dataclass(frozen=True)
@@ -216,6 +227,7 @@ class ColorPath:
             shape=shape,
             share=share,
             side_probability=right if side == "right" else 1 - right,
+            pixels=_HAND * place.metre,
         )
 
 

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 CONTEXT_SIZE: Final = 7
 COLOR_SIZE: Final = 9
-"""Numbers of the colour path: normal, direction, log of the spread, presence, and 1; all zero where it says nothing."""
+"""Numbers of the colour path: normal, direction, log of the spread, quality, and 1; all zero where it says nothing."""
 WITHIN: Final = math.cos(math.radians(30))
 _KAPPA: Final = (-2.0, 6.0)  # range of the log of the concentration
 

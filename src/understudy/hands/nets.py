@@ -16,6 +16,7 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from understudy.assets import model_path
 from understudy.detectors.blazepose_nets import Region, sigmoid, weighted_suppression
 from understudy.runtime import load
 
@@ -126,3 +127,8 @@ class HandNets:
         metres[:, :2] = metres[:, :2] @ (A[:, :2] / scale).T
         z = (xyz[:, 2] - xyz[WRIST, 2]) * scale * _Z_UNIT
         return HandLandmarks((xyz[:, :2] - 0.5) @ A[:, :2].T + A[:, 2], z, metres, float(presence[0, 0]), is_right)
+
+
+def load_nets(threads: int = 2) -> HandNets:
+    """The networks' files, fetched at first use. Raises ModelFileError where they cannot be had."""
+    return HandNets(model_path("palm_detection_full"), model_path("hand_landmark_full"), threads)

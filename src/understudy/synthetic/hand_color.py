@@ -21,6 +21,7 @@ _FOUND = torch.tensor([0.40, 0.56, 0.69, 0.73, 0.76])
 _FOUND_HIDDEN = 0.10
 _WRONG_SIZE = torch.tensor([24.0, 40.0, 75.0])
 _WRONG = torch.tensor([0.24, 0.11, 0.10, 0.04])
+_UNNOTICED = 0.15  # of the wrong ones, share that look as good as right ones
 _EDGE_ON = 0.2  # |cosine| of the normal and the view
 
 
@@ -32,7 +33,7 @@ def color_words(
     pixels: Float[Tensor, " b"],
     absent: float = 0.25,
 ) -> Float[Tensor, "b 9"]:
-    """Normal, direction, log of the spread, presence, 1; zeros where the colour path says nothing.
+    """Normal, direction, log of the spread, quality (`ColorPalm.quality`), 1; zeros where the colour path says nothing.
 
     visible: share of the hand that is seen. pixels: of its length in the colour image. absent: share of people of whom
     there is no usable colour at all, so that depth is learnt to suffice.
@@ -54,8 +55,10 @@ def color_words(
     n = torch.where(wrong[:, None], wrong_n, said_n)
     d = torch.where(wrong[:, None], wrong_d, said_d)
     spread = torch.where(wrong, 0.09, 0.07) * draw.lognormal(0.9, b)
-    presence = torch.where(wrong, draw.uniform(0.5, 0.9, b), 1 - 0.5 * draw.uniform(0, 1, b) ** 3)
-    words = torch.cat([n, d, spread.clamp_min(0.01).log()[:, None], presence[:, None], torch.ones(b, 1)], 1)
+    good = 0.96 - 0.6 * draw.uniform(0, 1, b) ** 3.5
+    doubtful = wrong & ~draw.chance(_UNNOTICED, b)
+    quality = torch.where(doubtful, 0.45 + 0.15 * draw.normal(b), good).clamp(0.02, 0.98)
+    words = torch.cat([n, d, spread.clamp_min(0.01).log()[:, None], quality[:, None], torch.ones(b, 1)], 1)
     return words * found[:, None]
 
 

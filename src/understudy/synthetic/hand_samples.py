@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from understudy.hands.crop import BEYOND, CELL, CELLS, EMPTY, LIMIT, SHORT
 from understudy.skeleton import JOINT
 from understudy.synthetic import render
 from understudy.synthetic.bodies import BodyBank, pose
@@ -28,21 +29,9 @@ from understudy.synthetic.scene import Boxes, Cameras, SceneConfig, about_z, pla
 from understudy.synthetic.segments import SEGMENT
 from understudy.synthetic.sensors import SENSORS, Rig
 
-CELLS: Final = 48
-HALF: Final = 0.18
-"""metres at the crop's distance: half the edge of the depth crop"""
-CELL: Final = 2 * HALF / CELLS
-EMPTY: Final = 1.0
-"""depth of cells without a measurement"""
-LIMIT: Final = 0.2
-"""metres: depths are cut off so far from the crop's distance"""
-CONTEXT: Final = ("wrist", "elbow", "shoulder", "other_shoulder", "neck", "hips", "nose")
-"""Joints whose places the network is given, relative to the crop's centre; the hand's own side first"""
-
 _RASTER = 80
 _FINE = 0.005  # metres of a raster's pixel at the hand
 _COARSE = 4  # the body's raster is so many times coarser
-_BEYOND = 0.07  # metres from the wrist along the forearm to the crop's centre
 _THINNED = 2  # of the body's points, every second
 _HAND_LENGTH = 0.19  # metres, for sizes in pixels
 _SIDES = ("right", "left")
@@ -241,7 +230,7 @@ class HandSamples:
         """What is believed of the body, and where it makes one look."""
         context = self._believed(draw, known)
         forearm = torch.nn.functional.normalize(context[:, 0] - context[:, 1], dim=1)
-        center = context[:, 0] + _BEYOND * forearm
+        center = context[:, 0] + BEYOND * forearm
         return _Views(context, crop_rotation(center, -forearm), center.norm(dim=1), people.rig.baseline * mirror)
 
     def _exact(
@@ -299,7 +288,7 @@ def crop_rotation(center: Float[Tensor, "b 3"], up: Float[Tensor, "b 3"]) -> Flo
     z = torch.nn.functional.normalize(center, dim=1)
     y = up - z * (up * z).sum(1, keepdim=True)
     upright = torch.tensor([0.0, 1.0, 0.0]) - z * z[:, 1:2]
-    short = y.norm(dim=1, keepdim=True) < 0.15  # the forearm points at the camera: the image's own upright
+    short = y.norm(dim=1, keepdim=True) < SHORT  # the forearm points at the camera: the image's own upright
     y = torch.nn.functional.normalize(torch.where(short, upright, y), dim=1)
     return torch.stack([torch.linalg.cross(y, z), y, z], 1)
 

@@ -35,12 +35,12 @@ def export_onnx(net: VoxelPoseNet, path: Path, half: bool = True) -> None:
         )  # fmt: skip
     model = onnx.load_from_string(buffer.getvalue())
     if half:
-        _halve(model.graph)
+        halve(model.graph)
     onnx.checker.check_model(model)
     write_atomically(path, model.SerializeToString())
 
 
-def _halve(graph: object) -> None:
+def halve(graph: object) -> None:
     """Every large float32 constant becomes float16, followed by a cast back, which runtimes carry out when loading."""
     from onnx import TensorProto, helper, numpy_helper
 

@@ -1,0 +1,304 @@
+"""Training of HandNormalNet: simulated hands, many epochs of them, each time seen a little differently (torch).
+
+OUT/config.json              the effective configuration, versions, command
+OUT/hands/train, OUT/hands/validation
+                             the simulated hands (`pool`); may be deleted after training
+OUT/log.csv, validation.csv  what happened
+OUT/checkpoint.safetensors   a run that is started again goes on from here
+OUT/weights.safetensors      the moving average of the weights
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any, Final
+
+import torch
+from safetensors.torch import save
+from torch import Tensor
+
+from understudy.errors import UnderstudyError
+from understudy.files import read_json, write_atomically
+from understudy.hands.crop import CELL, CELLS, EMPTY, LIMIT
+from understudy.hands.net import HandNormalNet, HandOutput, loss
+from understudy.hands.pool import SHARD, HandPool, PoolConfig
+from understudy.synthetic.draw import Draw
+from understudy.synthetic.hand_color import color_words
+from understudy.synthetic.hand_samples import HandBatch
+from understudy.voxelposenet import records
+from understudy.voxelposenet.checkpoint import load_checkpoint, save_checkpoint
+from understudy.voxelposenet.processes import Stop
+
+KIND: Final = "hands"
+"""What config.json calls such a run."""
+CONFIG, CHECKPOINT, WEIGHTS, HANDS = "config.json", "checkpoint.safetensors", "weights.safetensors", "hands"
+FREE: Final = ("workers", "validate_every", "checkpoint_every", "log_every")
+"""Fields that may change when a run goes on."""
+
+_SHIFT = 4  # cells: how far crops are moved
+_DEPTH_SHIFT = 0.02  # metres, one sigma
+_COLOR_PIXELS = 1.5  # pixels of the colour image for one of the depth image
+_BLIND = 0.03  # share of hands without any depth
+_VALIDATION_BATCH = 512
+
+
+@dataclass(frozen=True)
+class HandTrainConfig:
+    """Everything that decides the weights."""
+
+    data: PoolConfig = field(default_factory=PoolConfig)
+    shards: int = 240
+    """of 512 simulated hands"""
+    epochs: int = 10
+    batch: int = 256
+    learning_rate: float = 2e-3
+    warmup: int = 200
+    weight_decay: float = 0.05
+    ema: float = 0.998
+    seed: int = 0
+    validation_shards: int = 8
+    validate_every: int = 500
+    checkpoint_every: int = 250
+    log_every: int = 25
+    workers: int = 2
+    """processes that simulate"""
+
+    def __post_init__(self) -> None:
+        for name in (
+            "shards",
+            "epochs",
+            "batch",
+            "validation_shards",
+            "validate_every",
+            "checkpoint_every",
+            "log_every",
+        ):
+            if getattr(self, name) < 1:
+                raise UnderstudyError(f"{name} {getattr(self, name)}: must be at least 1")
+
+    def rate(self, step: int, steps: int) -> float:
+        """The learning rate of a step: linear warm-up, then a cosine down to a hundredth."""
+        if step < self.warmup:
+            return self.learning_rate * (step + 1) / self.warmup
+        done = (step - self.warmup) / max(1, steps - self.warmup)
+        return self.learning_rate * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * min(1.0, done))))
+
+    def validation(self) -> PoolConfig:
+        """Other people, hands and scenes."""
+        data = self.data
+        return replace(
+            data, bank_seed=data.bank_seed + 1000, bodies=min(60, data.bodies), hands=min(40, data.hands),
+            seed=data.seed + 900,
+        )  # fmt: skip
+
+
+class HandTrainer:
+    """One training run; an interruption loses nothing."""
+
+    def __init__(self, config: HandTrainConfig, out: Path):
+        self.config, self.out = config, Path(out)
+        torch.manual_seed(config.seed)
+        self.net = HandNormalNet()
+        decay = [p for p in self.net.parameters() if p.ndim > 1]
+        rest = [p for p in self.net.parameters() if p.ndim <= 1]
+        groups = [{"params": decay, "weight_decay": config.weight_decay}, {"params": rest, "weight_decay": 0.0}]
+        self.optimizer = torch.optim.AdamW(groups, lr=config.learning_rate)
+        self.average = {k: v.detach().clone() for k, v in self.net.state_dict().items()}
+        self.step, self.seconds = 0, 0.0
+        self._prepare()
+
+    @property
+    def steps(self) -> int:
+        """Of the whole run."""
+        return self.config.epochs * (self.config.shards * SHARD // self.config.batch)
+
+    def _prepare(self) -> None:
+        path = self.out / CONFIG
+        now = json.loads(json.dumps(asdict(self.config)))
+        if path.exists():
+            before = read_json(path)
+            if before.get("kind") != KIND:
+                raise UnderstudyError(f"{path}: the run there is of another network; choose another folder")
+            for name, value in now.items():
+                if name not in FREE and before["config"].get(name) != value:
+                    raise UnderstudyError(
+                        f"{path}: the run there has another {name} ({before['config'].get(name)!r}, now {value!r}); "
+                        "choose another folder, or delete that one"
+                    )
+        if (self.out / CHECKPOINT).exists():
+            self.step, self.seconds = load_checkpoint(self.out / CHECKPOINT, self.net, self.average, self.optimizer)
+        for name in (records.LOG, records.VALIDATION):
+            records.keep_until(self.out / name, self.step)
+        about = {"kind": KIND, "config": now, "command": sys.argv, "torch": torch.__version__}
+        self.out.mkdir(parents=True, exist_ok=True)
+        write_atomically(path, json.dumps(about, indent=1) + "\n")
+
+    def pools(self) -> tuple[HandPool, HandPool]:
+        """The stores for training and validation."""
+        folder, config = self.out / HANDS, self.config
+        return (
+            HandPool(folder / "train", config.data, config.shards),
+            HandPool(folder / "validation", config.validation(), config.validation_shards),
+        )
+
+    def run(
+        self,
+        report: Callable[[dict[str, Any]], object] = lambda row: None,
+        progress: Callable[[int], object] = lambda step: None,
+    ) -> HandNormalNet:
+        """Trains to the end (the pools must be filled). Returns the network with the averaged weights.
+
+        report: gets each line of the log and of the validations. progress: gets the number of steps done.
+        Raises KeyboardInterrupt after it has saved when Ctrl-C or SIGTERM asks to stop.
+        """
+        train, validation = (pool.load() for pool in self.pools())
+        usable = train.in_view.nonzero()[:, 0]
+        start, seconds = time.monotonic(), self.seconds
+        sums: dict[str, float] = {}
+        since = 0
+        with Stop() as stop:
+            while self.step < self.steps:
+                parts = self._learn(self._draw(train, usable))
+                self.step += 1
+                since += 1
+                self.seconds = seconds + time.monotonic() - start
+                sums = {k: sums.get(k, 0.0) + float(v) for k, v in parts.items()}
+                progress(self.step)
+                last = self.step == self.steps
+                if self.step % self.config.log_every == 0 or last:
+                    row = {"step": self.step, "hours": round(self.seconds / 3600, 4)}
+                    row |= {k: round(v / since, 4) for k, v in sums.items()}
+                    if not math.isfinite(row["loss"]):
+                        raise UnderstudyError(f"step {self.step}: the loss is {row['loss']}")
+                    records.append(self.out / records.LOG, [row])
+                    report(row)
+                    sums, since = {}, 0
+                if self.step % self.config.checkpoint_every == 0 or last or stop.asked:
+                    self._save()
+                if stop.asked:
+                    raise KeyboardInterrupt
+                if self.step % self.config.validate_every == 0 or last:
+                    row = {
+                        "step": self.step,
+                        "hours": round(self.seconds / 3600, 4),
+                        **scores(self.averaged(), validation),
+                    }
+                    records.append(self.out / records.VALIDATION, [row])
+                    report(row)
+        return self.averaged()
+
+    def _draw(self, pool: HandBatch, usable: Tensor) -> HandBatch:
+        """The hands of the step: epoch by epoch, each in an order of its own."""
+        per_epoch = len(usable) // self.config.batch
+        epoch, place = divmod(self.step, per_epoch)
+        generator = torch.Generator().manual_seed(self.config.seed * 1009 + epoch)
+        order = usable[torch.randperm(len(usable), generator=generator)]
+        rows = order[place * self.config.batch : (place + 1) * self.config.batch]
+        return HandBatch(*(t[rows] for t in pool))
+
+    def _learn(self, batch: HandBatch) -> dict[str, Tensor]:
+        self.net.train()
+        for group in self.optimizer.param_groups:
+            group["lr"] = self.config.rate(self.step, self.steps)
+        draw = Draw(self.config.seed * 7919 + self.step)
+        batch = varied(draw, batch)
+        output: HandOutput = self.net(batch.depth, batch.context, batch.distance, colored(draw, batch))
+        total, parts = loss(output, batch.normal, batch.direction, batch.landmarks)
+        self.optimizer.zero_grad(set_to_none=True)
+        total.backward()
+        torch.nn.utils.clip_grad_norm_(self.net.parameters(), 5.0)
+        self.optimizer.step()
+        keep = min(self.config.ema, (self.step + 1) / (self.step + 10))
+        with torch.no_grad():
+            for k, v in self.net.state_dict().items():
+                if v.is_floating_point():
+                    self.average[k].lerp_(v, 1 - keep)
+                else:
+                    self.average[k].copy_(v)
+        return {"loss": total.detach(), **{k: v.detach() for k, v in parts.items()}}
+
+    def averaged(self) -> HandNormalNet:
+        """A copy with the averaged weights, for use."""
+        net = HandNormalNet()
+        net.load_state_dict(self.average)
+        return net.eval()
+
+    def _save(self) -> None:
+        save_checkpoint(self.out / CHECKPOINT, self.net, self.average, self.optimizer, self.step, self.seconds)
+        write_atomically(self.out / WEIGHTS, save({k: v.contiguous() for k, v in self.average.items()}))
+
+
+def varied(draw: Draw, batch: HandBatch) -> HandBatch:
+    """The same hands, believed to be a little elsewhere, and measured a little worse."""
+    b = len(batch.depth)
+    depth = batch.depth.float()
+    du, dv = (draw.integers(2 * _SHIFT + 1, b) - _SHIFT for _ in range(2))
+    dz = _DEPTH_SHIFT * draw.normal(b)
+    near = _rolled(depth[:, 0], du, dv)
+    gone = draw.chance(draw.uniform(0, 0.4, b, 1, 1) * draw.chance(0.3, b, 1, 1), b, CELLS, CELLS)
+    gone |= draw.chance(_BLIND, b, 1, 1)
+    seen = (near < EMPTY) & ~gone & (near + dz[:, None, None] > -LIMIT)
+    near = torch.where(seen, (near + dz[:, None, None]).clamp_max(LIMIT), EMPTY)
+    shift = torch.stack([du * CELL, dv * CELL, dz], -1)[:, None]
+    context = batch.context + shift + 0.006 * draw.normal(*batch.context.shape)
+    return batch._replace(
+        depth=torch.stack([near, seen.float()], 1), context=context, distance=batch.distance - dz[:, None],
+        landmarks=batch.landmarks + shift,
+    )  # fmt: skip
+
+
+def _rolled(near: Tensor, du: Tensor, dv: Tensor) -> Tensor:
+    """Moved by (du, dv) cells; EMPTY comes in at the sides."""
+    wide = torch.nn.functional.pad(near, (_SHIFT,) * 4, value=EMPTY)
+    at = torch.arange(CELLS)
+    rows = at + _SHIFT - dv[:, None]
+    columns = at + _SHIFT - du[:, None]
+    return wide[torch.arange(len(near))[:, None, None], rows[:, :, None], columns[:, None, :]]
+
+
+def colored(draw: Draw, batch: HandBatch) -> Tensor:
+    """What the colour path says of the hands."""
+    pixels = batch.pixels * _COLOR_PIXELS * draw.lognormal(0.3, len(batch.pixels))
+    return color_words(draw, batch.normal, batch.direction, batch.visible, pixels)
+
+
+@torch.no_grad()
+def predict(net: HandNormalNet, batch: HandBatch, seed: int = 0) -> HandOutput:
+    """The network's word on hands as they are, with simulated colour words."""
+    parts = []
+    for start in range(0, len(batch.depth), _VALIDATION_BATCH):
+        part = HandBatch(*(t[start : start + _VALIDATION_BATCH] for t in batch))
+        color = colored(Draw(seed * 31 + start + 5), part)
+        parts.append(net(part.depth.float(), part.context, part.distance, color))
+    return HandOutput(*(torch.cat(p) for p in zip(*parts, strict=True)))
+
+
+def scores(net: HandNormalNet, hands: HandBatch) -> dict[str, float]:
+    """Errors in degrees over the hands in view: of all, of visible, hidden and gripping ones; and the calibration."""
+    hands = HandBatch(*(t[hands.in_view] for t in hands))
+    output = predict(net, hands)
+    error = torch.rad2deg(torch.acos((output.normal * hands.normal).sum(1).clamp(-1, 1)))
+    sure = output.sure.sigmoid()
+    bins = (sure * 10).long().clamp_max(9)
+    gaps = [
+        float((bins == k).float().mean() * (sure[bins == k].mean() - (error[bins == k] < 30).float().mean()).abs())
+        for k in range(10)
+        if (bins == k).any()
+    ]
+    visible, hidden = hands.visible > 0.5, hands.visible < 0.2
+    groups = {"all": hands.in_view, "visible": visible, "hidden": hidden, "half": ~visible & ~hidden}
+    groups["gripping"] = (hands.grip > 0) & visible
+    out: dict[str, float] = {}
+    for name, rows in groups.items():
+        chosen = error[rows]
+        out |= {f"{name}_mean": float(chosen.mean()), f"{name}_median": float(chosen.median())}
+        out[f"{name}_flips"] = float((chosen > 90).float().mean())
+    landmarks = (output.landmarks - hands.landmarks).norm(dim=2).mean(1)
+    out |= {"landmarks_cm": float(100 * landmarks[groups["visible"]].mean()), "calibration": sum(gaps)}
+    return {k: round(v, 4) for k, v in out.items()}
