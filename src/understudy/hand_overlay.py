@@ -1,4 +1,8 @@
-"""Hands in pictures: thin bones, and arrows out of the palms. A ring lies flat on the palm, round the arrow's foot."""
+"""Hands in pictures: thin bones, and arrows out of the palms.
+
+An arrow that points at the camera, or away from it, is hardly more than a dot. So a small disc lies on the hand at the
+arrow's foot: white where the camera looks into the palm, a ring where it sees the back of the hand.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +24,7 @@ LOW_CONFIDENCE: Final = 0.5
 """below this confidence a palm is thin and faint"""
 
 _CORNERS = [HAND_KEYPOINTS.index(name) for name in ("wrist", "index_1", "pinky_1")]
-_FOOT_M = 0.022
+_FOOT_M = 0.022  # radius of the disc
 _TURN = np.linspace(0, 2 * np.pi, 24, endpoint=False)
 _SHORTEST = 25  # pixels: hands that look smaller get no bones
 _SMALL = 60  # pixels: hands that look smaller get thinner outlines
@@ -28,8 +32,10 @@ _FAR = 1e5  # pixels: beyond, nothing is drawn
 
 
 def palm_middle(person: Person, side: str) -> Float[np.ndarray, "3"] | None:
-    """Where a palm's arrow starts, metres: the mean of the hand's wrist and the knuckles of index and little finger, of
-    those that are known; the body's wrist where none is. None where there is no palm or no such place.
+    """Where a palm's arrow starts, metres; None where there is no palm, or no place for it.
+
+    The mean of the hand's wrist and its knuckles of index and little finger, of those that are known; else the body's
+    wrist.
     """
     palm = person.hands.get(side)
     if palm is None:
@@ -57,7 +63,7 @@ class HandFigure:
     arrow: Float[np.ndarray, "2 2"] | None
     """from the palm along its normal; None where it cannot be seen"""
     foot: Float[np.ndarray, "n 2"] | None
-    """a circle on the palm, round the arrow's foot"""
+    """the rim of the disc at the arrow's foot"""
     faces_camera: bool
     weak: bool
     """confidence below `LOW_CONFIDENCE`"""
@@ -74,7 +80,8 @@ class HandFigure:
         middle = palm_middle(person, side)
         arrow, foot, faces = None, None, False
         if middle is not None:
-            radius = max(_FOOT_M, 1.5 * thickness * float(middle[2]) / camera.fx)
+            pixel = max(float(middle[2]), 0.0) / camera.fx  # metres
+            radius = float(np.clip(_FOOT_M, 1.5 * thickness * pixel, 2.5 * thickness * pixel))
             points = np.stack([middle, middle + PALM_ARROW_M * palm.normal, *_circle(middle, palm.normal, radius)])
             uv = camera.project(points)
             faces = bool(middle @ palm.normal < 0)
@@ -95,21 +102,15 @@ class HandFigure:
                     canvas.line(self.uv[a], self.uv[b], color, stroke)
 
     def draw_palm(self, canvas: Canvas) -> None:
-        """The arrow, and its foot on the camera's side of it: white where the palm is seen, else a ring."""
+        """The arrow and the disc; what is nearer to the camera comes last."""
         if self.arrow is None or self.foot is None:
             return
         width = 1 if self.weak else max(1, self.thickness // 2)
         if self.faces_camera:
-            self._draw_foot(canvas, WHITE, width)
+            _draw_disc(canvas, self.foot, WHITE, width)
         canvas.arrow(self.arrow[0], self.arrow[1], WHITE, width)
         if not self.faces_camera:
-            self._draw_foot(canvas, self.color, width)
-
-    def _draw_foot(self, canvas: Canvas, inside: Rgb, width: int) -> None:
-        points = [np.rint(16 * self.foot).astype(np.int32)]
-        cv2.polylines(canvas.image, points, True, OUTLINE, width + 2, cv2.LINE_AA, 4)
-        cv2.fillPoly(canvas.image, points, inside, cv2.LINE_AA, 4)
-        cv2.polylines(canvas.image, points, True, WHITE, width, cv2.LINE_AA, 4)
+            _draw_disc(canvas, self.foot, self.color, width)
 
 
 def _keypoints(palm: Palm, camera: Camera) -> Float[np.ndarray, "21 2"]:
@@ -128,3 +129,11 @@ def _circle(middle: Float[np.ndarray, "3"], normal: Float[np.ndarray, "3"], radi
     a = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
     a /= np.linalg.norm(a)
     return middle + radius * (np.cos(_TURN)[:, None] * a + np.sin(_TURN)[:, None] * np.cross(normal, a))
+
+
+def _draw_disc(canvas: Canvas, rim: Float[np.ndarray, "n 2"], inside: Rgb, width: int) -> None:
+    """A white ring and what is inside it."""
+    points = [np.rint(16 * rim).astype(np.int32)]  # OpenCV draws at 1/16 pixel
+    cv2.polylines(canvas.image, points, True, OUTLINE, width + 2, cv2.LINE_AA, 4)
+    cv2.fillPoly(canvas.image, points, inside, cv2.LINE_AA, 4)
+    cv2.polylines(canvas.image, points, True, WHITE, width, cv2.LINE_AA, 4)

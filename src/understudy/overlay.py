@@ -162,7 +162,7 @@ class _Figure:
         return max(1.5, 1.3 * self.thickness)
 
     def draw_bones(self, canvas: Canvas, *, weak: bool) -> None:
-        """Outlined lines: those with a weak end, or the others."""
+        """Outlined lines: those with a weak end, or the others; hands too."""
         drawn = [b for b in BONES if np.isfinite(self.uv[list(b)]).all() and bool(self.weak[list(b)].any()) == weak]
         thin = weak or self.person.failed is not None
         t = max(1, self.thickness // 2) if thin else self.thickness
@@ -170,6 +170,9 @@ class _Figure:
             canvas.line(self.uv[a], self.uv[b], OUTLINE, t + max(2, t))
         for a, b in drawn:
             canvas.line(self.uv[a], self.uv[b], bone_color((a, b), self.color), t)
+        for hand in self.hands:
+            if hand.weak == weak:
+                hand.draw_bones(canvas)
 
     def draw_joints(self, canvas: Canvas) -> None:
         """Disc: observed. Ring: inferred. Cross: only in 2D."""
@@ -192,10 +195,10 @@ class _Figure:
             canvas.outlined_disc(at, max(0.8, 0.3 * self.thickness), WHITE)
 
     def draw_palms(self, canvas: Canvas, *, weak: bool) -> None:
-        """Hands, and arrows out of the palms: the doubtful ones, or the others."""
-        for hand in (h for h in self.hands if h.weak == weak):
-            hand.draw_bones(canvas)
-            hand.draw_palm(canvas)
+        """Arrows out of the palms: the doubtful ones, or the others."""
+        for hand in self.hands:
+            if hand.weak == weak:
+                hand.draw_palm(canvas)
 
 
 def _draw_legend(canvas: Canvas) -> None:

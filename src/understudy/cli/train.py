@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from understudy.cli import train_hands
 from understudy.cli.common import command, needs_extra
 from understudy.errors import UnderstudyError, one_of
 
@@ -26,6 +27,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         "train a network on simulated people",
         "  understudy train runs/first\n"
         "  understudy train runs/smoke --preset smoke\n"
+        "  understudy train runs/hands --preset hands\n"
         "  understudy train runs/no-kinect --without-sensor kinect2 --steps 5000\n"
         "  torchrun --nproc_per_node 2 -m understudy train runs/two\n"
         "\nThe same command goes on with an interrupted run; so does `understudy train OUT` alone. The folder's\n"
@@ -33,7 +35,11 @@ def add(commands: argparse._SubParsersAction) -> None:
         "`understudy weights export OUT --out DIR` makes the files for use.",
     )
     parser.add_argument("out", type=Path, metavar="OUT", help="folder of the run")
-    parser.add_argument("--preset", metavar="NAME", help="default (default), smoke (seconds), paper (as published)")
+    parser.add_argument(
+        "--preset",
+        metavar="NAME",
+        help="default (default), smoke (seconds), paper (as published); hands: the network of palm normals",
+    )
     parser.add_argument("--config", type=Path, metavar="FILE", help="JSON with fields that replace the preset's")
     parser.add_argument("--steps", type=int, metavar="N", help="how long to train")
     parser.add_argument("--batch", type=int, metavar="N", help="people per step and process")
@@ -52,6 +58,9 @@ def add(commands: argparse._SubParsersAction) -> None:
 
 def _train(arguments: argparse.Namespace) -> None:
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # idle threads leave the cores to the simulation
+    if train_hands.wanted(arguments):
+        train_hands.train(arguments)
+        return
     with needs_extra("training", "train"):
         from understudy.voxelposenet.training import Trainer
     trainer = Trainer(_config(arguments), arguments.out)

@@ -63,6 +63,7 @@ class HandTrainConfig:
     ema: float = 0.998
     seed: int = 0
     validation_shards: int = 8
+    validation_seed: int = 900
     validate_every: int = 500
     checkpoint_every: int = 250
     log_every: int = 25
@@ -94,7 +95,7 @@ class HandTrainConfig:
         data = self.data
         return replace(
             data, bank_seed=data.bank_seed + 1000, bodies=min(60, data.bodies), hands=min(40, data.hands),
-            seed=data.seed + 900,
+            seed=self.validation_seed,
         )  # fmt: skip
 
 

@@ -8,8 +8,9 @@ import numpy as np
 from jaxtyping import Float
 
 from understudy.camera import Camera
-from understudy.overlay import PALM_ARROW_M, Rgb, bone_color, describe, joint_color, person_color
-from understudy.skeleton import BONES, FACE, JOINT
+from understudy.hand_overlay import PALM_ARROW_M, palm_middle, sure
+from understudy.overlay import Rgb, bone_color, describe, joint_color, person_color
+from understudy.skeleton import BONES, FACE, HAND_BONES, JOINT
 from understudy.types import INFERRED, Person
 from understudy.viewer.cloud import Cloud, near_people, thin
 from understudy.viewer.floor import find_floor
@@ -18,6 +19,12 @@ from understudy.viewer.results import Moment
 JOINT_RADIUS_M = 0.028
 FACE_RADIUS_M = 0.016
 BONE_WIDTH_M = 0.025
+HAND_BONE_WIDTH_M = 0.007
+ARROW = (225, 0, 120)
+"""RGB of palms' arrows: white, as in pictures, is lost on the white page"""
+SURE_ARROW = {"shaft_radius": 0.009, "head_radius": 0.022, "head_length": 0.045}
+FAINT_ARROW = {"shaft_radius": 0.003, "head_radius": 0.01, "head_length": 0.03}
+"""metres; of palms whose confidence is low"""
 FOV = float(np.deg2rad(45))
 RIGHT = np.array([1.0, 0.0, 0.0])
 FROM = np.array([0.5, 0.42, 0.75])
@@ -163,12 +170,28 @@ class Scene:
         )
 
     def _draw_palms(self, person: Person, where: str) -> None:
+        """Arrows out of the palms, and the hands' bones."""
         for side, palm in person.hands.items():
-            wrist = person.keypoints[JOINT[f"{side}_wrist"]]
-            if palm is not None and np.isfinite(wrist).all():
-                arrow = np.stack([wrist, wrist + PALM_ARROW_M * palm.normal])[None]
-                sizes = {"shaft_radius": 0.008, "head_radius": 0.02, "head_length": 0.04}
-                self._keep(self._api.add_arrows(f"{where}/{side}_palm", arrow, (250, 250, 250), **sizes))
+            if palm is None:
+                continue
+            middle = palm_middle(person, side)
+            if middle is not None:
+                arrow = np.stack([middle, middle + PALM_ARROW_M * palm.normal])[None]
+                color, sizes = (ARROW, SURE_ARROW) if sure(palm) else (pale(ARROW), FAINT_ARROW)
+                self._keep(self._api.add_arrows(f"{where}/{side}_palm", arrow, color, **sizes))
+            if palm.keypoints is not None:
+                known = np.isfinite(palm.keypoints).all(axis=1)
+                bones = [b for b in HAND_BONES if known[list(b)].all()]
+                if bones:
+                    color = joint_color(JOINT[f"{side}_wrist"], person_color(person.id))
+                    self._keep(
+                        self._api.add_line_segments(
+                            f"{where}/{side}_hand",
+                            palm.keypoints[np.array(bones)].astype(np.float32),
+                            np.tile(np.array(shade(color, not sure(palm)), np.uint8), (len(bones), 2, 1)),
+                            thickness=HAND_BONE_WIDTH_M,
+                        )
+                    )
 
     def _draw_camera(self, moment: Moment) -> None:
         camera = self._camera

@@ -124,12 +124,12 @@ def from_json(data: Mapping[str, Any], base: TrainConfig, where: str) -> TrainCo
 
     Raises UnderstudyError that begins with `where` and names the field.
     """
-    config: TrainConfig = _filled(data, base, where)
+    config: TrainConfig = filled(data, base, where)
     return config
 
 
-def _filled(data: Mapping[str, Any], base: Any, where: str) -> Any:
-    """`from_json` for any dataclass."""
+def filled(data: Mapping[str, Any], base: Any, where: str) -> Any:
+    """`base`, any dataclass, with the values of a JSON object in place of its own; see `from_json`."""
     known = {f.name for f in fields(base)}
     changed: dict[str, Any] = {}
     for name, value in data.items():
@@ -139,7 +139,7 @@ def _filled(data: Mapping[str, Any], base: Any, where: str) -> Any:
         if is_dataclass(old):
             if not isinstance(value, Mapping):
                 raise UnderstudyError(f"{where}: {name!r} must be an object, got {value!r}")
-            changed[name] = _filled(value, old, f"{where}: {name}")
+            changed[name] = filled(value, old, f"{where}: {name}")
         else:
             changed[name] = _value(value, old, f"{where}: {name!r}")
     try:
