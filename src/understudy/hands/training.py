@@ -34,11 +34,12 @@ from understudy.synthetic.hand_samples import HandBatch
 from understudy.voxelposenet import records
 from understudy.voxelposenet.checkpoint import load_checkpoint, save_checkpoint
 from understudy.voxelposenet.processes import Stop
+from understudy.voxelposenet.training import can_compile
 
 KIND: Final = "hands"
 """What config.json calls such a run."""
 CONFIG, CHECKPOINT, WEIGHTS, HANDS = "config.json", "checkpoint.safetensors", "weights.safetensors", "hands"
-FREE: Final = ("workers", "validate_every", "checkpoint_every", "log_every")
+FREE: Final = ("workers", "compile", "validate_every", "checkpoint_every", "log_every")
 """Fields that may change when a run goes on."""
 
 _SHIFT = 4  # cells: how far crops are moved
@@ -67,6 +68,8 @@ class HandTrainConfig:
     validate_every: int = 500
     checkpoint_every: int = 250
     log_every: int = 25
+    compile: bool = True
+    """through torch.compile, which needs a C++ compiler, and is 1.3 times as fast"""
     workers: int = 2
     """processes that simulate"""
 
@@ -160,6 +163,8 @@ class HandTrainer:
         """
         train, validation = (pool.load() for pool in self.pools())
         usable = train.in_view.nonzero()[:, 0]
+        if self.config.compile and can_compile():
+            self.net.compile()
         start, seconds = time.monotonic(), self.seconds
         sums: dict[str, float] = {}
         since = 0
