@@ -8,6 +8,7 @@ from pathlib import Path
 
 from understudy.cli.common import command, needs_extra
 from understudy.errors import ModelFileError, UnderstudyError, one_of
+from understudy.files import read_json
 
 
 def add(commands: argparse._SubParsersAction) -> None:
@@ -45,8 +46,12 @@ def add(commands: argparse._SubParsersAction) -> None:
 
 def _export(arguments: argparse.Namespace) -> None:
     with needs_extra("exporting weights", "train"):
+        from understudy.hands.publish import publish as publish_hands
         from understudy.voxelposenet.publish import publish
-    for path in publish(arguments.source, arguments.out, progress=True):
+    path = arguments.source / "config.json"
+    of_hands = path.exists() and read_json(path).get("kind") == "hands"
+    made = publish_hands if of_hands else publish
+    for path in made(arguments.source, arguments.out, progress=True):
         print(f"  {path}")
 
 

@@ -1,1 +1,5 @@
-"""Which way palms face."""
+"""Which way palms face: `HandNormalEstimator`."""
+
+from understudy.hands.estimator import HandNormalEstimator
+
+__all__ = ["HandNormalEstimator"]

@@ -34,6 +34,7 @@ from understudy.synthetic.hand_samples import HandBatch
 from understudy.voxelposenet import records
 from understudy.voxelposenet.checkpoint import load_checkpoint, save_checkpoint
 from understudy.voxelposenet.processes import Stop
+from understudy.voxelposenet.train_config import filled
 from understudy.voxelposenet.training import can_compile
 
 KIND: Final = "hands"
@@ -105,7 +106,8 @@ class HandTrainConfig:
 class HandTrainer:
     """One training run; an interruption loses nothing."""
 
-    def __init__(self, config: HandTrainConfig, out: Path):
+    def __init__(self, config: HandTrainConfig, out: Path, record: bool = True):
+        """out: folder of the run. record: make it, or go on in it; otherwise it is only read."""
         self.config, self.out = config, Path(out)
         torch.manual_seed(config.seed)
         self.net = HandNormalNet()
@@ -115,12 +117,19 @@ class HandTrainer:
         self.optimizer = torch.optim.AdamW(groups, lr=config.learning_rate)
         self.average = {k: v.detach().clone() for k, v in self.net.state_dict().items()}
         self.step, self.seconds = 0, 0.0
-        self._prepare()
+        if record:
+            self._prepare()
 
     @property
     def steps(self) -> int:
         """Of the whole run."""
         return self.config.epochs * (self.config.shards * SHARD // self.config.batch)
+
+    @classmethod
+    def reading(cls, run: Path) -> HandTrainer:
+        """The trainer of a run that is there."""
+        config = filled(read_json(run / CONFIG)["config"], HandTrainConfig(), str(run / CONFIG))
+        return cls(config, run, record=False)
 
     def _prepare(self) -> None:
         path = self.out / CONFIG

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from safetensors.torch import load, save
 from torch import Tensor
 
@@ -23,9 +23,10 @@ from understudy.skeleton import HAND_KEYPOINTS
 from understudy.synthetic.kinematics import axes, cross, unit
 
 FINGERS: Final = ("thumb", "index", "middle", "ring", "pinky")
-PARTS: Final = ("palm", *(f"{finger}_{k}" for finger in FINGERS for k in (1, 2, 3)))
-"""What moves as one: the palm with the forearm's end, then three bones of each finger, from the knuckle outwards."""
-VERSION: Final = 1
+PARTS: Final = ("palm", *(f"{finger}_{k}" for finger in FINGERS for k in (1, 2, 3)), "forearm")
+"""What moves as one: the palm, then three bones of each finger, from the knuckle outwards, and the forearm's end."""
+FOREARM: Final = PARTS.index("forearm")
+VERSION: Final = 2
 
 _FOREARM = 0.14  # metres of the forearm that come along
 _WIDTH_SIGMA, _THICK_SIGMA = 0.06, 0.08  # of the log: hands of one length differ
@@ -40,12 +41,12 @@ class HandBank:
     points: Float[Tensor, "n p 3"]
     normals: Float[Tensor, "n p 3"]
     """unit, outward"""
-    weights: Float[Tensor, "p 16"]
+    weights: Float[Tensor, "p 17"]
     """skinning weights over PARTS; rows sum to 1"""
-    heads: Float[Tensor, "n 16 3"]
-    """rotation centres of the parts; the palm's is the wrist"""
-    flexion: Float[Tensor, "n 16 3"]
-    """unit axes about which a positive angle bends a part towards the palm; the palm's is not used"""
+    heads: Float[Tensor, "n 17 3"]
+    """rotation centres of the parts; the wrist is that of palm and forearm"""
+    flexion: Float[Tensor, "n 17 3"]
+    """unit axes about which a positive angle bends a part towards the palm; those of palm and forearm are not used"""
     landmarks: Float[Tensor, "n 21 3"]
 
     def __len__(self) -> int:
@@ -55,6 +56,11 @@ class HandBank:
     def device(self) -> torch.device:
         """Where the tensors are."""
         return self.points.device
+
+    @property
+    def of_hand(self) -> Bool[Tensor, " p"]:
+        """Which points are the hand's, not the forearm's."""
+        return self.weights[:, FOREARM] < 0.5
 
     def to(self, device: torch.device | str) -> HandBank:
         """The same bank on another device."""
@@ -71,12 +77,17 @@ class PosedHands:
 
 
 def articulate(
-    bank: HandBank, ids: Int[Tensor, " b"], flex: Float[Tensor, "b 5 3"], spread: Float[Tensor, "b 5"]
+    bank: HandBank,
+    ids: Int[Tensor, " b"],
+    flex: Float[Tensor, "b 5 3"],
+    spread: Float[Tensor, "b 5"],
+    elbow: Float[Tensor, "b 3"],
 ) -> PosedHands:
-    """Bends fingers.
+    """Bends fingers and wrist.
 
     ids: which hands. flex: radians of each joint, thumb to pinky, from the knuckle outwards; 0 = as at rest. spread:
-    about the palm's normal, away from the palm's middle towards the thumb.
+    about the palm's normal, away from the palm's middle towards the thumb. elbow: unit vectors from the wrist to the
+    elbow, hand frame.
     """
     heads, axis = bank.heads[ids], bank.flexion[ids]
     b, device = len(ids), bank.device
@@ -94,6 +105,7 @@ def articulate(
             t = t + (R @ (center - (own @ center[..., None])[..., 0])[..., None])[..., 0]
             R = R @ own
             turn[:, part], shift[:, part] = R, t
+    turn[:, FOREARM] = shortest_turn(torch.tensor([-1.0, 0.0, 0.0], device=device), elbow)
     blended = bank.weights @ torch.cat([turn.flatten(2), shift], 2)  # (B, P, 12)
     R, t = blended[..., :9].unflatten(2, (3, 3)), blended[..., 9:]
     points = (R @ bank.points[ids][..., None])[..., 0] + t
@@ -110,6 +122,13 @@ def about(axis: Float[Tensor, "b 3"], angle: Float[Tensor, " b"]) -> Float[Tenso
     K = torch.stack([o, -z, y, z, o, -x, -y, x, o], -1).unflatten(-1, (3, 3))
     s, c = angle.sin()[:, None, None], angle.cos()[:, None, None]
     return torch.eye(3, device=axis.device) + s * K + (1 - c) * (K @ K)
+
+
+def shortest_turn(start: Float[Tensor, "3"], end: Float[Tensor, "b 3"]) -> Float[Tensor, "b 3 3"]:
+    """The smallest rotations that take one unit vector to others."""
+    start = start.expand_as(end)
+    axis = torch.linalg.cross(start, end)
+    return about(unit(axis), torch.atan2(axis.norm(dim=1), (start * end).sum(1)))
 
 
 def palm_normals(landmarks: Float[Tensor, "b 21 3"]) -> Float[Tensor, "b 3"]:
@@ -182,12 +201,14 @@ def build_hands(n: int, seed: int, points: int) -> HandBank:
     return HandBank(spots, out, w / w.sum(1, keepdim=True), centers, _flexion(centers, tips), marks)
 
 
-def _part_weights(model: Any) -> tuple[Float[Tensor, "v 16"], Tensor]:
+def _part_weights(model: Any) -> tuple[Float[Tensor, "v 17"], Tensor]:
     """anny's skinning weights of the right hand, summed over PARTS, and which vertices are mostly hand or forearm."""
     column = {}
     for i, label in enumerate(model.bone_labels):
-        if label.startswith(("wrist", "metacarpal", "lowerarm")) and label.endswith(".R"):
+        if label.startswith(("wrist", "metacarpal")) and label.endswith(".R"):
             column[i] = 0
+        elif label.startswith("lowerarm") and label.endswith(".R"):
+            column[i] = FOREARM
         elif label.startswith("finger") and label.endswith(".R"):
             finger, bone = label.removeprefix("finger").removesuffix(".R").split("-")
             column[i] = 1 + 3 * (int(finger) - 1) + int(bone) - 1
@@ -214,9 +235,10 @@ def _frames(model: Any, heads: Tensor) -> tuple[Float[Tensor, "n 3 3"], Float[Te
     return axes(middle - wrist, normal), wrist
 
 
-def _centers(model: Any, bones: Tensor) -> Float[Tensor, "n 16 3"]:
+def _centers(model: Any, bones: Tensor) -> Float[Tensor, "n 17 3"]:
     named = [f"finger{f}-{k}" for f in range(1, 6) for k in (1, 2, 3)]
-    return torch.stack([torch.zeros_like(bones[:, 0]), *(_bone(model, bones, b) for b in named)], 1)
+    wrist = torch.zeros_like(bones[:, 0])
+    return torch.stack([wrist, *(_bone(model, bones, b) for b in named), wrist], 1)
 
 
 def _tips(model: Any, local: Tensor, bones: Tensor) -> Float[Tensor, "n 5 3"]:
@@ -231,7 +253,7 @@ def _tips(model: Any, local: Tensor, bones: Tensor) -> Float[Tensor, "n 5 3"]:
     return torch.stack(out, 1)
 
 
-def _flexion(centers: Float[Tensor, "n 16 3"], tips: Float[Tensor, "n 5 3"]) -> Float[Tensor, "n 16 3"]:
+def _flexion(centers: Float[Tensor, "n 17 3"], tips: Float[Tensor, "n 5 3"]) -> Float[Tensor, "n 17 3"]:
     """Fingers bend about axes across them that lie in the palm; the thumb bends towards the pinky's knuckle."""
     out = torch.zeros_like(centers)
     palm = torch.tensor([0.0, 0.0, 1.0]).expand(len(centers), 3)

@@ -37,7 +37,7 @@ class GripConfig:
     """of these, share with a bar; the others hold something flat"""
     handle: float = 0.5
     """of the bars, share with a board (a door) behind"""
-    lies: float = 0.1
+    lies: float = 0.15
     """of the free hands, share that lie on a board"""
 
 

@@ -22,7 +22,7 @@ from understudy.synthetic.bodies import BodyBank, pose
 from understudy.synthetic.clothing import dress
 from understudy.synthetic.draw import Draw
 from understudy.synthetic.furniture import place_boxes
-from understudy.synthetic.hand_bank import HandBank, articulate, palm_normals
+from understudy.synthetic.hand_bank import HandBank, about, articulate, palm_normals
 from understudy.synthetic.hand_grips import Board, GripConfig, draw_board, draw_grips, finger_bend, held_points
 from understudy.synthetic.poses import NAMES, sample_poses
 from understudy.synthetic.scene import Boxes, Cameras, SceneConfig, about_z, place_cameras
@@ -33,6 +33,8 @@ _RASTER = 80
 _FINE = 0.005  # metres of a raster's pixel at the hand
 _COARSE = 4  # the body's raster is so many times coarser
 _THINNED = 2  # of the body's points, every second
+_WRIST = (0.6, 0.2)  # radians, one sigma: bent, sideways
+_MOST_BENT = 0.1  # cosine of the angle between hand and forearm
 _HAND_LENGTH = 0.19  # metres, for sizes in pixels
 _SIDES = ("right", "left")
 _ROWS = {
@@ -75,6 +77,10 @@ class HandConfig:
     scene: SceneConfig = field(default_factory=lambda: SceneConfig(furniture=2, occluder=0.15, neighbours=0.0))
     sensors: tuple[str, ...] = tuple(SENSORS)
     grips: GripConfig = field(default_factory=GripConfig)
+    turned: float = 0.45
+    """share of hands that are bent and twisted at the wrist by more than the posture says"""
+    sleeves: float = 0.6
+    """share of forearms in sleeves"""
     wrist_m: float = 0.025
     """one sigma of the estimated wrist along each axis; a fifth of them three times as much"""
     joint_m: float = 0.04
@@ -102,6 +108,8 @@ class _Hands:
 
     skin: Float[Tensor, "b p 3"]
     normals: Float[Tensor, "b p 3"]
+    counts: Bool[Tensor, " p"]
+    """which points are the hand's own, not the forearm's"""
     held: Float[Tensor, "b q 3"]
     marks: Float[Tensor, "b 21 3"]
     normal: Float[Tensor, "b 3"]
@@ -181,7 +189,7 @@ class HandSamples:
         hips = people.joints[:, _HIPS].mean(1, keepdim=True)
         known = torch.cat([people.joints[:, rows[:5]], hips, people.joints[:, rows[5:]]], 1)
         known = people.cameras.to_cam(known) * mirror
-        hands = self._hands(draw, people, side, mirror, known[:, 0])
+        hands = self._hands(draw, people, side, mirror, known)
         views = self._views(draw, people, mirror, known)
         exact, visible = self._exact(people, side, mirror, hands, views)
         pitch = torch.tensor([_PIXEL[n] for n in self.config.sensors])[people.rig.kind]
@@ -203,20 +211,25 @@ class HandSamples:
             grip=hands.grip,
         )
 
-    def _hands(self, draw: Draw, people: _People, side: str, mirror: Tensor, wrist: Float[Tensor, "b 3"]) -> _Hands:
+    def _hands(self, draw: Draw, people: _People, side: str, mirror: Tensor, known: Float[Tensor, "b 7 3"]) -> _Hands:
         """Hands in detail, with what they hold, at the wrists."""
         R = people.cameras.R_cam_world @ people.R_world_segment[:, SEGMENT[f"{side}_hand"]]
         # the bodies' hands point along -x (right) or x (left), palms down
         x, z = R[..., 0] * (-mirror[0] * mirror), -R[..., 2] * mirror
+        wrist, elbow = known[:, 0], torch.nn.functional.normalize(known[:, 1] - known[:, 0], dim=1)
         axes = torch.stack([x, torch.linalg.cross(z, x), z], 1)  # hand frame -> camera, rows
+        axes = turned(draw, self.config.turned, axes, elbow)
+        x, _, z = axes.unbind(1)
         grips = draw_grips(draw, self.config.grips, finger_bend(people.rotations, side))
         ids = draw.integers(len(self.hands), len(wrist))
-        hand = articulate(self.hands, ids, grips.flex, grips.spread)
+        hand = articulate(self.hands, ids, grips.flex, grips.spread, (axes @ elbow[..., None])[..., 0])
+        skin = hand.points + hand.normals * self._sleeves(draw, ids)
         held = held_points(draw, grips, hand.landmarks)
         board = draw_board(draw, self.config.grips, grips)
         behind = (z * torch.nn.functional.normalize(wrist, dim=1)).sum(1) > -0.2  # of the hand, as the camera sees it
         return _Hands(
-            skin=hand.points @ axes + wrist[:, None],
+            skin=skin @ axes + wrist[:, None],
+            counts=self.hands.of_hand,
             normals=hand.normals @ axes,
             held=held @ axes + wrist[:, None],
             marks=hand.landmarks @ axes + wrist[:, None],
@@ -225,6 +238,13 @@ class HandSamples:
             board=board.moved(axes, wrist, board.there & behind),
             grip=grips.kind,
         )
+
+    def _sleeves(self, draw: Draw, ids: Int[Tensor, " b"]) -> Float[Tensor, "b p 1"]:
+        """How thick the cloth is on each point, metres."""
+        b = len(ids)
+        begin, thick = draw.uniform(-0.01, 0.1, b), draw.uniform(0.003, 0.022, b)
+        covered = (self.hands.points[ids, :, 0] < -begin[:, None]) & draw.chance(self.config.sleeves, b)[:, None]
+        return (covered * thick[:, None])[..., None]
 
     def _views(self, draw: Draw, people: _People, mirror: Tensor, known: Float[Tensor, "b 7 3"]) -> _Views:
         """What is believed of the body, and where it makes one look."""
@@ -246,7 +266,7 @@ class HandSamples:
         rays = render.pixel_rays(views.scale, _RASTER)
         exact = torch.minimum(back, hands.board.moved(views.R.mT, -views.offset[:, 0]).cast(rays))
         n = hands.skin.shape[1]
-        return exact, visible_share(detail[:, :n], ~away[..., 0], exact, views.scale)
+        return exact, visible_share(detail[:, :n], ~away[..., 0] & hands.counts, exact, views.scale)
 
     def _background(self, people: _People, side: str, mirror: Tensor, views: _Views) -> Float[Tensor, "b s s"]:
         """Depth of the rest of the body and of the furniture, coarsely."""
@@ -281,6 +301,24 @@ class HandSamples:
         ray = torch.nn.functional.normalize(joints, dim=2)
         noise = draw.normal(b, n, 3) * 0.8 + ray * draw.normal(b, n, 1) * 0.9
         return joints + noise * (sigma * gross)[..., None] + ray * 0.02 * draw.normal(b, 1, 1)
+
+
+def turned(
+    draw: Draw, share: float, axes: Float[Tensor, "b 3 3"], elbow: Float[Tensor, "b 3"]
+) -> Float[Tensor, "b 3 3"]:
+    """Hands with other wrists, as far as wrists go: bent towards palm or back, sideways, and twisted.
+
+    axes: rows, the hand frame's axes. elbow: unit vectors from the wrist, in the same frame as the axes.
+    """
+    b = len(axes)
+    flexed, sideways = (s * draw.normal(b) for s in _WRIST)
+    twisted = torch.where(draw.chance(0.5, b), draw.uniform(-1.3, 1.3, b), 0.0)
+    along, across, out = torch.eye(3).unbind(0)
+    other = about(across.expand(b, 3), flexed) @ about(out.expand(b, 3), sideways) @ about(along.expand(b, 3), twisted)
+    other = other @ axes
+    bent = -(other[:, 0] * elbow).sum(1)  # cosine
+    chosen = draw.chance(share, b) & (bent > _MOST_BENT)
+    return torch.where(chosen[:, None, None], other, axes)
 
 
 def crop_rotation(center: Float[Tensor, "b 3"], up: Float[Tensor, "b 3"]) -> Float[Tensor, "b 3 3"]:
