@@ -28,7 +28,7 @@ def random_person(seed: int) -> Person:
 
 
 @given(st.lists(st.integers(0, 2**31), max_size=3), st.none() | st.floats(0, 1e6), st.none() | st.text(min_size=1))
-@settings(max_examples=40)
+@settings(max_examples=40, deadline=None)
 def test_round_trip(seeds, timestamp, skipped):
     frame = FramePeople(7, tuple(random_person(s) for s in seeds), timestamp, skipped)
     data = json.loads(json.dumps(frame_to_json(frame), allow_nan=False))

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Final
 
 from understudy import detectors, methods
 from understudy.detectors.base import Detector
-from understudy.errors import UnderstudyError
+from understudy.errors import UnderstudyError, one_of
+from understudy.hands.estimator import HandNormalEstimator
 from understudy.methods import METHODS
 from understudy.registration import register
 from understudy.types import Frame, Keypoints2D, Person, RegisteredFrame
 
-__all__ = ["METHODS", "Estimator"]
+__all__ = ["HANDS", "METHODS", "Estimator"]
+
+HANDS: Final = ("full", "depth", "off")
 
 
 class Estimator:
@@ -21,6 +25,7 @@ class Estimator:
     2. `detect`: 2D keypoints of everybody in the colour image.
     3. `lift`: keypoints + depth -> 3D joints, by the chosen method. `voxelposenet` has stages of its own
        (`voxel_lifting`: root, view, network, assembly); `naive` is the baseline.
+    4. `find_hands`: which way the palms face (`understudy.hands`).
 
     Stateless: frames may come in any order. Identities over time are the business of `tracking`.
     """
@@ -31,23 +36,30 @@ class Estimator:
         detector: Detector | str = "blazepose",
         min_score: float = 0.2,
         weights: Path | None = None,
+        hands: str = "full",
     ):
         """method: one of METHODS. detector: an object, or a name that `detectors.create` knows.
 
         min_score: 2D keypoints with a lower score are not used, in [0, 1]. weights: an exported network of one's own.
+        hands: one of HANDS; `full` looks at colour and depth, `depth` at depth alone (a tenth of the time), `off` at
+        nothing.
         """
         if not 0 <= min_score <= 1:
             raise UnderstudyError(f"min_score {min_score}: must be in [0, 1]")
+        if hands not in HANDS:
+            raise UnderstudyError(f"hands {hands!r}: must be {one_of(HANDS)}")
         self.method = method
         self.min_score = min_score
         self.detector = detectors.create(detector) if isinstance(detector, str) else detector
         self._lifter = methods.create(method, min_score, weights)
+        self._hands = None if hands == "off" else HandNormalEstimator(color=hands == "full")
 
     def estimate(self, frame: Frame | RegisteredFrame) -> list[Person]:
         """People of one frame, as many as the detector finds; who cannot be lifted is listed with `failed`."""
         registered = self.register(frame)
         keypoints = self.detect(registered)
-        return self.lift(registered, keypoints)
+        people = self.lift(registered, keypoints)
+        return self.find_hands(registered, people)
 
     def register(self, frame: Frame | RegisteredFrame) -> RegisteredFrame:
         """Stage 1. A frame that is registered passes through."""
@@ -60,3 +72,10 @@ class Estimator:
     def lift(self, frame: RegisteredFrame, keypoints: list[Keypoints2D]) -> list[Person]:
         """Stage 3. One Person for each entry of `keypoints`, numbered in that order."""
         return [person.with_id(i) for i, person in enumerate(self._lifter.lift(frame, keypoints))]
+
+    def find_hands(self, frame: RegisteredFrame, people: list[Person]) -> list[Person]:
+        """Stage 4. The same people with their palms."""
+        if self._hands is None:
+            return people
+        hands = self._hands.estimate_all(frame, people)
+        return [person.with_hands(h) for person, h in zip(people, hands, strict=True)]

@@ -59,6 +59,7 @@ class Settings:
     detector_input: str
     """which files a detector reads its keypoints from; empty for others"""
     min_score: float
+    hands: str = "full"
     weights: str = ""
     """SHA-256 of a network of one's own; empty for the one that comes with the package"""
     version: str = understudy.__version__
@@ -73,6 +74,7 @@ def estimate_recording(
     detector: str = "blazepose",
     min_score: float = 0.2,
     weights: Path | None = None,
+    hands: str = "full",
     overlays: bool = True,
     restart: bool = False,
     progress: bool = False,
@@ -86,12 +88,12 @@ def estimate_recording(
     Raises RecordingError when `out` holds results of other settings, or something that is not ours.
     """
     out = Path(out)
-    estimator = Estimator(method, detectors.create(detector, recording), min_score, weights)
+    estimator = Estimator(method, detectors.create(detector, recording), min_score, weights, hands)
     source = (out / PAIR).resolve() if isinstance(recording, PairRecording) else recording.path.resolve()
     reads = _detector_input(recording, detector)
     cameras = recording.camera.to_json()
     own = hashlib.sha256(weights.read_bytes()).hexdigest() if weights else ""
-    settings = Settings(str(source), cameras, recording.unit_m, method, detector, reads, min_score, own)
+    settings = Settings(str(source), cameras, recording.unit_m, method, detector, reads, min_score, hands, own)
     _prepare(out, settings, restart)
     name = recording.name
     if isinstance(recording, PairRecording):

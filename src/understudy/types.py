@@ -230,3 +230,6 @@ class Person:
 
     def with_id(self, id: int) -> Person:
         return replace(self, id=id)
+
+    def with_hands(self, hands: Hands) -> Person:
+        return replace(self, hands=hands)

@@ -35,6 +35,12 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument(
         "--min-score", type=float, default=0.2, metavar="S", help="2D keypoints below are not lifted (default 0.2)"
     )
+    parser.add_argument(
+        "--hands",
+        default="full",
+        metavar="HOW",
+        help="palm normals from colour and depth (full, default), depth, or off",
+    )
     parser.add_argument("--no-overlays", action="store_true", help="do not draw a picture per frame")
     parser.add_argument("--restart", action="store_true", help="begin anew instead of going on")
     parser.set_defaults(run=_estimate, after_interrupt="; the same command goes on where it stopped")
@@ -50,6 +56,7 @@ def _estimate(arguments: argparse.Namespace) -> int:
         detector=arguments.detector,
         min_score=arguments.min_score,
         weights=arguments.weights,
+        hands=arguments.hands,
         overlays=not arguments.no_overlays,
         restart=arguments.restart,
         progress=True,
