@@ -46,7 +46,7 @@ def recording(tmp_path):
 def run(recording, out, **options):
     """By the naive method, whose joints are known exactly."""
     return estimate_recording(
-        recordings.open(recording), out, **{"method": "naive", "detector": "recording", **options}
+        recordings.open(recording), out, **{"method": "naive", "detector": "recording", "hands": "depth", **options}
     )
 
 

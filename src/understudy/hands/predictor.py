@@ -61,6 +61,7 @@ class HandPredictor:
         distance = np.array([[view.distance] for view in views], np.float32)
         said = self.network(depth=depth, context=context, distance=distance, color=color)
         normal, direction, kappa, landmarks, sure = (part.astype(np.float64) for part in said)
+        normal, direction = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in (normal, direction))
         return [
             HandPrediction(
                 view.directions_to_cam(normal[i]),

@@ -1,0 +1,284 @@
+"""Palms: laws of the hand's view, the network in use, reasons why there is no palm; and what the method reaches."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from understudy import recordings
+from understudy.camera import Camera
+from understudy.errors import ModelFileError, UnderstudyError
+from understudy.estimator import Estimator
+from understudy.hands import HandNormalEstimator
+from understudy.hands import estimator as hands_module
+from understudy.hands.color_path import ColorPalm
+from understudy.hands.crop import CELL, CELLS, EMPTY, HALF, LIMIT, HandView, arm_context, crop_rotation
+from understudy.hands.estimator import supported
+from understudy.hands.predictor import HandPredictor, color_word
+from understudy.skeleton import JOINT, N_JOINTS
+from understudy.types import Keypoints2D, Person, RegisteredDepth, RegisteredFrame
+
+SIDES = ("left", "right")
+MIRROR = np.array([-1.0, 1.0, 1.0])
+
+
+def skeleton(seed: int = 0) -> np.ndarray:
+    """A person 2.5 m away, arms wherever."""
+    rng = np.random.default_rng(seed)
+    return rng.normal(0, 0.25, (N_JOINTS, 3)) + [0.2, 0, 2.5]
+
+
+def person(joints: np.ndarray) -> Person:
+    nothing = Keypoints2D(np.zeros((N_JOINTS, 2)), np.zeros(N_JOINTS))
+    return Person(nothing, joints, np.ones(N_JOINTS), np.full(N_JOINTS, 0.02), ("observed",) * N_JOINTS)
+
+
+def mirrored_sides(joints: np.ndarray) -> np.ndarray:
+    """Left and right joints exchanged."""
+    out = joints.copy()
+    for name, row in JOINT.items():
+        other = name.replace("left", "?").replace("right", "left").replace("?", "right")
+        out[JOINT[other]] = joints[row]
+    return out
+
+
+def cloud_around(view: HandView, n: int = 4000, seed: int = 1) -> np.ndarray:
+    return view.center + np.random.default_rng(seed).normal(0, 0.1, (n, 3))
+
+
+@pytest.mark.parametrize("side", SIDES)
+def test_view_goes_there_and_back(side: str) -> None:
+    joints = skeleton()
+    view = HandView.of(joints, side)
+    assert view is not None
+    assert np.linalg.det(view.R) == pytest.approx(1.0 if side == "right" else -1.0)
+    np.testing.assert_allclose(view.R @ view.R.T, np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(view.to_cam(view.context), arm_context(joints, side), atol=1e-12)
+    np.testing.assert_allclose(view.directions_to_cam(view.directions_from_cam(np.eye(3))), np.eye(3), atol=1e-12)
+    forearm = view.context[0] - view.context[1]
+    assert abs(forearm[0]) < 1e-9 and forearm[1] < 0  # upwards in the crop
+
+
+def test_a_turned_world_gives_the_same_crop() -> None:
+    """The crop does not depend on where in the image, or how turned, the hand is."""
+    joints = skeleton(3)
+    view = HandView.of(joints, "right")
+    points = cloud_around(view)
+    turn = Rotation.from_rotvec([0.2, -0.1, 0.9]).as_matrix()
+    other = HandView.of(joints @ turn.T, "right")
+    np.testing.assert_allclose(other.context, view.context, atol=1e-9)
+    np.testing.assert_allclose(other.depth_crop(points @ turn.T), view.depth_crop(points), atol=1e-6)
+    np.testing.assert_allclose(
+        other.directions_to_cam(np.eye(3)), view.directions_to_cam(np.eye(3)) @ turn.T, atol=1e-9
+    )
+
+
+def test_a_left_hand_is_a_right_one_in_the_mirror() -> None:
+    joints = skeleton(4)
+    left = HandView.of(joints, "left")
+    right = HandView.of(mirrored_sides(joints) * MIRROR, "right")
+    points = cloud_around(left)
+    np.testing.assert_allclose(right.context, left.context, atol=1e-12)
+    np.testing.assert_array_equal(right.depth_crop(points * MIRROR), left.depth_crop(points))
+    np.testing.assert_allclose(right.directions_to_cam(np.eye(3)), left.directions_to_cam(np.eye(3)) * MIRROR)
+
+
+def test_crop_of_a_plane_is_flat_and_whole() -> None:
+    view = HandView.of(skeleton(5), "right")
+    steps = (np.arange(CELLS) + 0.5) * CELL - HALF
+    x, y = np.meshgrid(steps, steps)
+    plane = np.stack([x, y, np.zeros_like(x)], -1).reshape(-1, 3)
+    crop = view.depth_crop(view.to_cam(plane))
+    assert crop[1].all()
+    np.testing.assert_allclose(crop[0], 0.0, atol=1e-6)
+    assert (view.depth_crop(view.to_cam(plane + [0, 0, -LIMIT - 0.01]))[0] == EMPTY).all()  # an occluder before it
+    scale = (view.distance + 1.0) / view.distance
+    far = view.depth_crop(view.to_cam(plane * scale + [0, 0, 1.0]))
+    np.testing.assert_allclose(far[0][far[1] > 0], LIMIT, atol=1e-6)
+
+
+def test_crop_needs_only_the_points_near() -> None:
+    camera = Camera(320, 240, np.array([[280.0, 0, 159.5], [0, 280, 119.5], [0, 0, 1]]))
+    z = np.random.default_rng(2).uniform(1.5, 3.5, (240, 320)).astype(np.float32)
+    depth = RegisteredDepth(z, camera)
+    v, u = np.mgrid[0:240.0, 0:320.0]
+    everything = camera.unproject(np.stack([u.ravel(), v.ravel()], 1), z.ravel().astype(np.float64))
+    for seed in range(6):
+        view = HandView.of(skeleton(seed) + [0.4 * (seed % 3 - 1), 0, 0], SIDES[seed % 2])
+        np.testing.assert_allclose(view.depth_crop(view.points_near(depth)), view.depth_crop(everything), atol=1e-5)
+
+
+def test_forearm_towards_the_camera_still_has_a_view() -> None:
+    center = np.array([0.1, 0.2, 2.0])
+    R = crop_rotation(center, -center / np.linalg.norm(center))
+    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
+    assert R[1, 1] > 0.9  # the image's own upright
+
+
+def test_no_view_without_an_arm() -> None:
+    joints = skeleton()
+    joints[JOINT["right_elbow"]] = np.nan
+    assert HandView.of(joints, "right") is None
+    assert HandView.of(joints, "left") is not None
+    joints[JOINT["nose"]] = np.nan
+    assert np.isfinite(HandView.of(joints, "left").context).all()
+    joints[JOINT["left_wrist"], 2] = -1.0
+    assert HandView.of(joints, "left") is None
+
+
+def test_support_needs_a_surface_at_the_right_depth() -> None:
+    marks = np.array([[0.0, 0, 2.0], [0.1, 0, 2.0], [0.2, 0, 2.0]])
+    cloud = np.array([[0.0, 0, 1.98], [0.1, 0, 1.6], [0.24, 0, 2.0]])
+    assert supported(marks, cloud).tolist() == [True, False, False]
+    assert not supported(marks, np.zeros((0, 3))).any()
+
+
+def test_color_word_is_in_the_view() -> None:
+    view = HandView.of(skeleton(), "left")
+    palm = ColorPalm(view.directions_to_cam(np.array([0.0, 0, 1])), view.directions_to_cam(np.array([0.0, -1, 0])),
+                     0.1, 0.9, np.zeros((21, 3)), np.zeros((21, 3)), 1.0, 0.8, 40.0)  # fmt: skip
+    word = color_word(view, palm)
+    np.testing.assert_allclose(word[:6], [0, 0, 1, 0, -1, 0], atol=1e-6)
+    assert word[6] == pytest.approx(np.log(0.1)) and 0 < word[7] < 1 and word[8] == 1
+    assert not color_word(view, None).any()
+
+
+# -- the network in use --------------------------------------------------------------------------------------------
+
+
+def frame_of(z: float | np.ndarray = 2.5) -> RegisteredFrame:
+    camera = Camera(320, 240, np.array([[280.0, 0, 159.5], [0, 280, 119.5], [0, 0, 1]]))
+    depth = np.broadcast_to(np.float32(z), (240, 320)).astype(np.float32)
+    return RegisteredFrame(np.full((240, 320, 3), 90, np.uint8), camera, RegisteredDepth(depth, camera))
+
+
+def test_mirror_image_gives_mirrored_palms() -> None:
+    """A law that no weights can break: the other hand in the mirror faces the mirrored way."""
+    estimator = HandNormalEstimator(color=False, least_confidence=0.0)
+    frame = frame_of(np.random.default_rng(0).uniform(2.2, 2.6, (240, 320)))
+    flipped = RegisteredFrame(
+        frame.color[:, ::-1].copy(), frame.camera, RegisteredDepth(frame.depth.z[:, ::-1].copy(), frame.camera)
+    )
+    joints = skeleton(7) - [0.2, 0, 0]
+    hands = estimator.estimate(frame, person(joints))
+    other = estimator.estimate(flipped, person(mirrored_sides(joints) * MIRROR))
+    for a, b in (("left", "right"), ("right", "left")):
+        np.testing.assert_allclose(other[b].normal, hands[a].normal * MIRROR, atol=2e-3)
+        assert other[b].confidence == pytest.approx(hands[a].confidence, abs=2e-3)
+
+
+def test_palm_has_what_a_gripper_needs() -> None:
+    hands = HandNormalEstimator(color=False, least_confidence=0.0).estimate(
+        frame_of(), person(skeleton(7) - [0.2, 0, 0])
+    )
+    for palm in hands.values():
+        assert np.linalg.norm(palm.normal) == pytest.approx(1) and np.linalg.norm(palm.direction) == pytest.approx(1)
+        R = palm.R_cam_hand
+        np.testing.assert_allclose(R.T @ R, np.eye(3), atol=1e-9)
+        assert np.linalg.det(R) == pytest.approx(1)
+        np.testing.assert_allclose(R[:, 2], palm.normal, atol=1e-9)
+        assert palm.keypoints.shape == (21, 3) and palm.keypoints_2d.shape == (21, 3)
+        assert 0 <= palm.confidence <= 1
+
+
+def test_everybody_at_once_is_the_same_as_one_by_one() -> None:
+    estimator = HandNormalEstimator(color=False, least_confidence=0.0)
+    people = [person(skeleton(k) - [0.2, 0, 0]) for k in range(3)]
+    together = estimator.estimate_all(frame_of(), people)
+    for one, hands in zip(people, together, strict=True):
+        alone = estimator.estimate(frame_of(), one)
+        for side in SIDES:
+            if hands[side] is None:
+                assert alone[side] is None
+            else:
+                np.testing.assert_allclose(alone[side].normal, hands[side].normal, atol=1e-5)
+
+
+def test_says_why_there_is_no_palm() -> None:
+    joints = skeleton() - [0.2, 0, 0]
+    joints[JOINT["left_elbow"]] = np.nan
+    joints[JOINT["right_wrist"]] = [3.0, 0, 2.5]
+    hands = HandNormalEstimator(color=False).estimate(frame_of(), person(joints))
+    assert hands.left is None and "elbow" in hands.why["left"]
+    assert hands.right is None and "outside" in hands.why["right"]
+    failed = Person.failure(Keypoints2D(np.zeros((N_JOINTS, 2)), np.zeros(N_JOINTS)), "no depth")
+    hands = HandNormalEstimator(color=False).estimate(frame_of(), failed)
+    assert all("no depth" in hands.why[side] for side in SIDES)
+    sure = HandNormalEstimator(color=False, least_confidence=1.0).estimate(frame_of(), person(skeleton() - [0.2, 0, 0]))
+    assert all(sure[s] is not None or "unsure" in sure.why[s] or "outside" in sure.why[s] for s in SIDES)
+    assert sure.why
+
+
+def test_bad_settings_are_named() -> None:
+    with pytest.raises(UnderstudyError, match="least_confidence"):
+        HandNormalEstimator(least_confidence=1.5)
+    with pytest.raises(UnderstudyError, match="hands 'both': must be"):
+        Estimator(hands="both")
+
+
+def test_without_the_colour_networks_depth_is_used(monkeypatch: pytest.MonkeyPatch) -> None:
+    def absent(threads: int = 2) -> None:
+        raise ModelFileError("offline: run `understudy models fetch`")
+
+    monkeypatch.setattr(hands_module, "load_nets", absent)
+    with pytest.warns(UserWarning, match="depth alone.*understudy models fetch"):
+        estimator = HandNormalEstimator()
+    assert estimator.color_path is None
+    assert estimator.estimate(frame_of(), person(skeleton(7) - [0.2, 0, 0])) is not None
+
+
+def test_nobody_no_hands() -> None:
+    assert HandNormalEstimator(color=False).estimate_all(frame_of(), []) == []
+    assert Estimator("naive", hands="off").find_hands(frame_of(), []) == []
+
+
+def test_exported_network_says_what_torch_says() -> None:
+    torch = pytest.importorskip("torch")
+    from safetensors.torch import load_file
+
+    from understudy.hands.net import HandNormalNet
+    from understudy.hands.predictor import weights_path
+
+    net = HandNormalNet()
+    state = load_file(weights_path().with_suffix(".safetensors"))
+    net.load_state_dict({k: v.float() if v.is_floating_point() else v for k, v in state.items()})
+    rng = np.random.default_rng(0)
+    view = HandView.of(skeleton(), "right")
+    depth = np.stack([view.depth_crop(cloud_around(view, seed=k)) for k in range(5)])
+    color = rng.normal(0, 0.5, (5, 9)).astype(np.float32)
+    said = HandPredictor()([view] * 5, depth, color)
+    context = torch.tensor(np.stack([view.context] * 5)).float()
+    with torch.no_grad():
+        out = net.eval()(torch.tensor(depth), context, torch.full((5, 1), view.distance), torch.tensor(color))
+    for k, word in enumerate(said):
+        np.testing.assert_allclose(view.directions_from_cam(word.normal), out.normal[k].numpy(), atol=1e-3)
+        np.testing.assert_allclose((word.landmarks - view.center) @ view.R.T, out.landmarks[k].numpy(), atol=1e-3)
+        assert word.confidence == pytest.approx(float(out.sure[k].sigmoid()), abs=1e-3)
+
+
+# -- what it reaches -----------------------------------------------------------------------------------------------
+
+
+def test_bundled_recording(models: None) -> None:
+    """Palms of people who were estimated from end to end."""
+    from understudy.metrics import evaluate
+    from understudy.people_file import FramePeople
+
+    recording = recordings.open("sample")
+    estimator = Estimator()
+    found = [FramePeople(index, tuple(estimator.estimate(recording[i]))) for i, index in enumerate(recording.indices)]
+    palms = evaluate(found, recording.truth).palms
+    assert palms.n_truth > 30
+    assert palms.coverage >= 0.9
+    assert np.degrees(palms.mean_rad) <= 20 and np.degrees(palms.median_rad) <= 12
+    assert palms.flipped <= 0.03
+
+
+def test_real_frame(freiburg: object, models: None) -> None:
+    """Of the man in front who holds a sheet of paper both hands are found; nobody has three."""
+    recording = recordings.open(freiburg)
+    people = Estimator().estimate(recording[0])
+    near = min(people, key=lambda p: p.keypoints[JOINT["neck"], 2])
+    assert any(palm is not None for palm in near.hands.values())
+    for p in people:
+        for palm in p.hands.values():
+            assert palm is None or np.linalg.norm(palm.normal) == pytest.approx(1)
