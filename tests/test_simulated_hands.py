@@ -274,7 +274,7 @@ def tiny(monkeypatch):
     monkeypatch.setattr(pools, "_BATCH", 16)
     return HandTrainConfig(
         data=PoolConfig(bodies=6, hands=6, bank_seed=77), shards=2, epochs=3, batch=16, warmup=2, validation_shards=1,
-        validate_every=4, checkpoint_every=2, log_every=1, workers=1, compile=False,
+        validate_every=4, checkpoint_every=2, log_every=1, workers=1,
     )  # fmt: skip
 
 

@@ -15,7 +15,10 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from understudy.hands.crop import CELL
+
 CONTEXT_SIZE: Final = 7
+N_LANDMARKS: Final = 21
 COLOR_SIZE: Final = 9
 """Numbers of the colour path: normal, direction, log of the spread, quality, and 1; all zero where it says nothing."""
 WITHIN: Final = math.cos(math.radians(30))
@@ -53,19 +56,29 @@ def _conv(inputs: int, outputs: int, size: int, stride: int = 1) -> nn.Sequentia
 
 
 class HandNormalNet(nn.Module):
-    """See the module's text."""
+    """See the module's text.
+
+    Landmarks are votes: every cell of a 12 x 12 map says where it believes each of them to be, and how much it counts.
+    """
 
     def __init__(self) -> None:
         super().__init__()
         known = 3 * CONTEXT_SIZE + 1 + COLOR_SIZE
-        self.first = _conv(2, 24, 5, 2)
-        self.down = _conv(24, 48, 3, 2)
         self.told = nn.Sequential(nn.Linear(known, 128), nn.ReLU(), nn.Linear(128, 128), nn.ReLU())
-        self.bias = nn.Linear(128, 48)
-        self.middle = nn.Sequential(_Residual(48), _conv(48, 96, 3, 2), _Residual(96), _Residual(96))
-        self.squeeze = _conv(96, 32, 1)
-        self.join = nn.Sequential(nn.Linear(32 * 36 + 96 + 128, 256), nn.ReLU(), nn.Linear(256, 192), nn.ReLU())
-        self.read = nn.Linear(192, 3 + 3 + 2 + 63)
+        self.first = _conv(2, 32, 5, 2)
+        self.bias = nn.Linear(128, 32)
+        self.fine = nn.Sequential(_Residual(32), _conv(32, 64, 3, 2), _Residual(64), _Residual(64))
+        self.bias_fine = nn.Linear(128, 64)
+        self.coarse = nn.Sequential(_conv(64, 128, 3, 2), _Residual(128), _Residual(128))
+        self.back = nn.Conv2d(128, 64, 1)
+        self.votes = nn.Sequential(_conv(64, 96, 3), nn.Conv2d(96, 4 * N_LANDMARKS, 1))
+        steps = (torch.arange(12) - 5.5) * (4 * CELL)
+        v, u = torch.meshgrid(steps, steps, indexing="ij")
+        self.register_buffer("grid", torch.stack([u, v, torch.zeros_like(u)]).flatten(1), persistent=False)
+        self.squeeze = _conv(128, 32, 1)
+        size = 32 * 36 + 128 + 128 + 3 * N_LANDMARKS
+        self.join = nn.Sequential(nn.Linear(size, 256), nn.ReLU(), nn.Linear(256, 192), nn.ReLU())
+        self.read = nn.Linear(192, 3 + 3 + 2)
         self.judge = nn.Sequential(nn.Linear(192 + 2, 48), nn.ReLU(), nn.Linear(48, 1))
 
     def forward(
@@ -78,14 +91,19 @@ class HandNormalNet(nn.Module):
         """Inputs as `HandBatch` has them. See `HandOutput`."""
         near, seen = depth[:, :1], depth[:, 1:]
         told = self.told(torch.cat([context.flatten(1) / 0.3, distance / 3, color], 1))
-        x = self.down(self.first(torch.cat([near * seen / 0.1, seen], 1)))
-        x = self.middle(x + self.bias(told)[:, :, None, None])
-        joined = self.join(torch.cat([self.squeeze(x).flatten(1), x.amax((2, 3)), told], 1))
+        x = self.first(torch.cat([near * seen / 0.1, seen], 1))
+        fine = self.fine(x + self.bias(told)[:, :, None, None])
+        coarse = self.coarse(fine + self.bias_fine(told)[:, :, None, None])
+        wide = F.relu(fine + F.interpolate(self.back(coarse), scale_factor=2.0, mode="nearest"))
+        votes = self.votes(wide).flatten(2).unflatten(1, (N_LANDMARKS, 4))
+        places = self.grid + 0.1 * votes[:, :, 1:]
+        marks = (votes[:, :, :1].softmax(3) * places).sum(3)
+        shape = (marks - marks.mean(1, keepdim=True)).flatten(1) / 0.05
+        joined = self.join(torch.cat([self.squeeze(coarse).flatten(1), coarse.amax((2, 3)), told, shape], 1))
         out = self.read(joined)
         kappa = out[:, 6:8].clamp(*_KAPPA)
         sure = self.judge(torch.cat([joined, kappa], 1).detach())[:, 0]
-        normal, direction = F.normalize(out[:, :3], dim=1), F.normalize(out[:, 3:6], dim=1)
-        return HandOutput(normal, direction, kappa, 0.1 * out[:, 8:].unflatten(1, (21, 3)), sure)
+        return HandOutput(F.normalize(out[:, :3], dim=1), F.normalize(out[:, 3:6], dim=1), kappa, marks, sure)
 
 
 def loss(

@@ -74,7 +74,9 @@ class HandBatch(NamedTuple):
 class HandConfig:
     """What decides the samples, besides bodies and hands."""
 
-    scene: SceneConfig = field(default_factory=lambda: SceneConfig(furniture=2, occluder=0.15, neighbours=0.0))
+    scene: SceneConfig = field(
+        default_factory=lambda: SceneConfig((0.55, 6.0), furniture=2, occluder=0.15, neighbours=0.0)
+    )
     sensors: tuple[str, ...] = tuple(SENSORS)
     grips: GripConfig = field(default_factory=GripConfig)
     turned: float = 0.45

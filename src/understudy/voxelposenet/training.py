@@ -113,7 +113,7 @@ class Trainer:
         """
         config = self.config
         model: nn.Module = _Learning(self.kind)
-        if config.compile and can_compile():
+        if config.compile and _can_compile():
             model.compile()
         if self.world.size > 1:
             model = nn.parallel.DistributedDataParallel(model)
@@ -232,7 +232,7 @@ class Trainer:
         self._saved = self.step
 
 
-def can_compile() -> bool:
+def _can_compile() -> bool:
     """Whether torch.compile has what it needs; says so where not."""
     compiler = os.environ.get("CXX", "g++")
     if shutil.which(compiler):
