@@ -39,7 +39,7 @@ from understudy.camera import Camera, RGBDCamera
 from understudy.detectors.blazepose_nets import Region
 from understudy.errors import RecordingError, UnderstudyError
 from understudy.hands.crop import CELLS, EMPTY
-from understudy.hands.nets import INDEX, PINKY, HandLandmarks, load_nets
+from understudy.hands.nets import INDEX, PINKY, HandLandmarks, HandNets, load_nets
 from understudy.recordings import FolderRecording, write_recording
 from understudy.recordings import open as open_recording
 from understudy.recordings.truth import Truth, TruthPerson
@@ -257,13 +257,13 @@ def test_without_depth():
     assert not without_depth(frame).depth.z.any() and frame.depth.z.all()
 
 
-class OneHand:
+class OneHand(HandNets):
     """Stands for the colour path's networks: a right hand's back or a left palm, wherever it looks."""
 
     def __init__(self):
         self.regions: list[Region] = []
 
-    def landmarks(self, crops, regions):
+    def landmarks(self, crops, regions, mirrored=False):
         self.regions += regions
         world = np.zeros((21, 3))
         world[INDEX], world[PINKY] = (-0.03, -0.09, 0), (0.03, -0.09, 0)

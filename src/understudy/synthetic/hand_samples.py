@@ -23,7 +23,7 @@ from understudy.synthetic.clothing import dress
 from understudy.synthetic.draw import Draw
 from understudy.synthetic.furniture import place_boxes
 from understudy.synthetic.hand_bank import HandBank, about, articulate, palm_normals
-from understudy.synthetic.hand_grips import Board, GripConfig, draw_board, draw_grips, finger_bend, held_points
+from understudy.synthetic.hand_grips import FREE, Board, GripConfig, draw_board, draw_grips, finger_bend, held_points
 from understudy.synthetic.poses import NAMES, sample_poses
 from understudy.synthetic.scene import Boxes, Cameras, SceneConfig, about_z, place_cameras
 from understudy.synthetic.segments import SEGMENT
@@ -81,6 +81,8 @@ class HandConfig:
     grips: GripConfig = field(default_factory=GripConfig)
     turned: float = 0.45
     """share of hands that are bent and twisted at the wrist by more than the posture says"""
+    pockets: float = 0.07
+    """share of hands that are under cloth, or gone in it"""
     sleeves: float = 0.6
     """share of forearms in sleeves"""
     wrist_m: float = 0.025
@@ -112,6 +114,8 @@ class _Hands:
     normals: Float[Tensor, "b p 3"]
     counts: Bool[Tensor, " p"]
     """which points are the hand's own, not the forearm's"""
+    covered: Bool[Tensor, " b"]
+    """under cloth"""
     held: Float[Tensor, "b q 3"]
     marks: Float[Tensor, "b 21 3"]
     normal: Float[Tensor, "b 3"]
@@ -225,13 +229,16 @@ class HandSamples:
         grips = draw_grips(draw, self.config.grips, finger_bend(people.rotations, side))
         ids = draw.integers(len(self.hands), len(wrist))
         hand = articulate(self.hands, ids, grips.flex, grips.spread, (axes @ elbow[..., None])[..., 0])
-        skin = hand.points + hand.normals * self._sleeves(draw, ids)
+        covered = draw.chance(self.config.pockets, len(wrist)) & (grips.kind == FREE)
+        cloth = self._sleeves(draw, ids) + self._pockets(draw, covered)
+        skin = hand.points + hand.normals * cloth
         held = held_points(draw, grips, hand.landmarks)
         board = draw_board(draw, self.config.grips, grips)
         behind = (z * torch.nn.functional.normalize(wrist, dim=1)).sum(1) > -0.2  # of the hand, as the camera sees it
         return _Hands(
             skin=skin @ axes + wrist[:, None],
             counts=self.hands.of_hand,
+            covered=covered,
             normals=hand.normals @ axes,
             held=held @ axes + wrist[:, None],
             marks=hand.landmarks @ axes + wrist[:, None],
@@ -247,6 +254,13 @@ class HandSamples:
         begin, thick = draw.uniform(-0.01, 0.1, b), draw.uniform(0.003, 0.022, b)
         covered = (self.hands.points[ids, :, 0] < -begin[:, None]) & draw.chance(self.config.sleeves, b)[:, None]
         return (covered * thick[:, None])[..., None]
+
+    def _pockets(self, draw: Draw, covered: Bool[Tensor, " b"]) -> Float[Tensor, "b p 1"]:
+        """How thick the cloth of a pocket is on each point, metres; NaN where a hand has no shape of its own in it."""
+        b = len(covered)
+        thick = torch.where(draw.chance(0.4, b), torch.nan, draw.uniform(0.008, 0.025, b))
+        on_hand = covered[:, None] & self.hands.of_hand
+        return torch.where(on_hand, thick[:, None], 0.0)[..., None]
 
     def _views(self, draw: Draw, people: _People, mirror: Tensor, known: Float[Tensor, "b 7 3"]) -> _Views:
         """What is believed of the body, and where it makes one look."""
@@ -268,7 +282,8 @@ class HandSamples:
         rays = render.pixel_rays(views.scale, _RASTER)
         exact = torch.minimum(back, hands.board.moved(views.R.mT, -views.offset[:, 0]).cast(rays))
         n = hands.skin.shape[1]
-        return exact, visible_share(detail[:, :n], ~away[..., 0] & hands.counts, exact, views.scale)
+        share = visible_share(detail[:, :n], ~away[..., 0] & hands.counts, exact, views.scale)
+        return exact, torch.where(hands.covered, 0.0, share)
 
     def _background(self, people: _People, side: str, mirror: Tensor, views: _Views) -> Float[Tensor, "b s s"]:
         """Depth of the rest of the body and of the furniture, coarsely."""
