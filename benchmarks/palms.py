@@ -35,11 +35,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if chosen.hands < 0:
         raise UnderstudyError(f"--hands {chosen.hands}: must be 0 (no simulated hands) or more")
     opened = with_palms([recordings.open(name) for name in chosen.recordings])  # fail now, not after the first one
-    sources: list[Source] = []
-    if chosen.hands:
-        sources.append(from_simulation(simulate(chosen.hands), HandPredictor().network))
-    methods = recording_methods(load_nets())
-    sources.insert(0, from_recordings(opened, methods, estimators(chosen.detector), chosen.detector))
+    people_of, methods = estimators(chosen.detector), recording_methods(load_nets())
+    simulated = simulate(chosen.hands) if chosen.hands else None
+    sources: list[Source] = [from_recordings(opened, methods, people_of, chosen.detector)]
+    if simulated is not None:
+        sources.append(from_simulation(simulated, HandPredictor().network))
     write_report(chosen.out, sources)
     for source in sources:
         print(f"{source.title}\n\n{main_table(source)}\n")

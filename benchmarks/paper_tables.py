@@ -87,6 +87,7 @@ def other_trainings(bodies: dict[str, Path], sensors: dict[str, Path]) -> tuple[
     if not sensors:
         notes.append("a sensor kept out of training: left out. No run was given (--held-out 'realsense=RUN')")
     found: dict[str, list[str]] = {"bodies": [], "without": []}
+    seen: dict[str, int] = {}
     for kind, runs in (("bodies", bodies), ("without", sensors)):
         for name, path in runs.items():
             title = RUN + name if kind == "bodies" else held_out_name(name)
@@ -96,7 +97,10 @@ def other_trainings(bodies: dict[str, Path], sensors: dict[str, Path]) -> tuple[
                 notes.append(f"{title}: left out. {e}")
             else:
                 found[kind].append(name)
-    return methods, Trainings(tuple(found["bodies"]), tuple(found["without"]), tuple(notes))
+                if (path / "config.json").is_file():
+                    run = json.loads((path / "config.json").read_text())["config"]
+                    seen[name] = run["steps"] * run["batch"]
+    return methods, Trainings(tuple(found["bodies"]), tuple(found["without"]), tuple(notes), seen)
 
 
 DEFAULT_RUNS = ("anny", "capsules", "both")

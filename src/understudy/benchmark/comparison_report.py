@@ -61,6 +61,8 @@ class Trainings:
     without: tuple[str, ...] = ()
     """sensors that were held out"""
     notes: tuple[str, ...] = field(default=())
+    seen: Mapping[str, int] = field(default_factory=dict)
+    """body set or sensor -> how many simulated people that run was shown"""
 
 
 def held_out_name(sensor: str) -> str:
@@ -252,17 +254,30 @@ def _trainings(groups: Sequence[Group], trainings: Trainings) -> Iterator[str]:
         e = evaluate_lifted(group.subjects, group.lifted[DETECTIONS, method], people).joints["in_view"]
         return f"{number(e.auc, 3)} ({_cm(e.epe_m)})"
 
+    def shown(run: str) -> str:
+        return f"{trainings.seen[run]:,}" if run in trainings.seen else "-"
+
+    if trainings.seen:
+        yield (
+            "These runs are shorter than the one whose weights are shipped (its model card says how long that was): "
+            "compare their rows with each other."
+        )
     if trainings.bodies:
         yield "AUC (EPE cm) of the network by the body set that it was trained on, on each set of test recordings:"
-        rows = [[b, *(cell(g, people, RUN + b) for g, people in sets.values())] for b in trainings.bodies]
-        yield markdown_lines(["trained on", *sets], rows)
+        rows = [[b, shown(b), *(cell(g, people, RUN + b) for g, people in sets.values())] for b in trainings.bodies]
+        yield markdown_lines(["trained on", "people shown", *sets], rows)
     if trainings.without:
         yield "AUC (EPE cm) on recordings of a sensor that was kept out of training:"
         rows = [
-            [f"{sensor}, {g.title}", cell(g, g.rows(sensor), held_out_name(sensor)), cell(g, g.rows(sensor), OURS)]
+            [
+                f"{sensor}, {g.title}",
+                shown(sensor),
+                cell(g, g.rows(sensor), held_out_name(sensor)),
+                cell(g, g.rows(sensor), OURS),
+            ]
             for sensor in trainings.without
             for g in groups
         ]
-        yield markdown_lines(["sensor", "trained without it", f"{OURS} (trained with it)"], rows)
+        yield markdown_lines(["sensor", "people shown", "trained without it", f"{OURS} (trained with it)"], rows)
     if not (trainings.bodies or trainings.without):
         yield "No other trainings were given (see below)."
