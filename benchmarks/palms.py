@@ -13,16 +13,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from understudy import recordings
+from understudy.benchmark.palm_recordings import estimators, from_recordings, recording_methods, with_palms
 from understudy.benchmark.palm_report import main_table, write_report
-from understudy.benchmark.palms import (
-    Source,
-    estimators,
-    from_recordings,
-    from_simulation,
-    recording_methods,
-    simulate,
-    with_palms,
-)
+from understudy.benchmark.palm_simulation import from_simulation, simulate
+from understudy.benchmark.palms import Source
 from understudy.errors import UnderstudyError
 from understudy.hands.nets import load_nets
 from understudy.hands.predictor import HandPredictor

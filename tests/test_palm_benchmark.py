@@ -10,7 +10,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from understudy.benchmark.palm_recordings import (
+    from_recordings,
+    papers_way,
+    recording_methods,
+    with_palms,
+    without_depth,
+)
 from understudy.benchmark.palm_report import LEAST, PLOTS, group_table, in_bins, main_table, within, write_report
+from understudy.benchmark.palm_simulation import SimulatedHands, from_simulation, least_sure
 from understudy.benchmark.palms import (
     ALL_GIVEN,
     BOTH,
@@ -22,18 +30,10 @@ from understudy.benchmark.palms import (
     PalmCalibration,
     PalmScore,
     Said,
-    SimulatedHands,
     Source,
     TrueHands,
-    from_recordings,
-    from_simulation,
     groups,
-    least_sure,
-    papers_way,
-    recording_methods,
     score,
-    with_palms,
-    without_depth,
 )
 from understudy.camera import Camera, RGBDCamera
 from understudy.detectors.blazepose_nets import Region

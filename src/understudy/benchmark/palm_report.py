@@ -17,6 +17,7 @@ from understudy.benchmark.palms import (
     CHECKED,
     DEPTH,
     HAND_M,
+    LIFTED,
     MAIN,
     PAPER,
     POSTURE,
@@ -56,6 +57,8 @@ _METHODS = {
     POSTURE: "the network without any depth around the hand and without the colour image: what the joints make likely. "
     "Nothing left out.",
     CHECKED: "the colour path's own normal, its quality as confidence; nothing where it finds no palm at the wrist.",
+    LIFTED: "the colour path's landmarks of the palm, each at the depth under it, and the plane through them; nothing "
+    "where it finds no palm or where fewer than four have depth.",
     PAPER: "our reading of what Zimmermann et al. (ICRA 2018) do, with another network (MediaPipe's): one crop "
     "where the body says that the hand is, no palm detection, nothing checked or left out; left or right is the body's "
     "word; the normal is that of the network's own 3D hand. It has no confidence. The paper reports a mean of 60.3 "
@@ -199,8 +202,7 @@ def _over_distance(source: Source) -> bytes:
     for axes, bars, (name, reduce) in zip(*panels, (("mean", mean), ("median", median)), strict=True):
         for i, method in enumerate(source.said):
             found = np.degrees(in_bins(distance, source.errors(method), edges, reduce))
-            some = ~np.isnan(found)
-            axes.plot(centers[some], found[some], marker="o", markersize=4, label=method, **_line(i, method))
+            axes.plot(centers, found, marker="o", markersize=4, label=method, **_line(i, method))
         axes.set_title(f"{name} of the given normals (where there are {LEAST} or more)", fontsize=11)
         axes.grid(alpha=0.3)
         bars.bar(centers, counts, np.diff(edges) * 0.9, color=_GREY)
@@ -229,7 +231,7 @@ def in_bins(
 
 def _line(i: int, method: str) -> dict[str, Any]:
     """Wide and pale for ALL_GIVEN, on which BOTH often lies."""
-    return _style(i) | ({"linewidth": 5.0, "alpha": 0.4} if method == ALL_GIVEN else {})
+    return _style(i) | ({"linewidth": 5.0, "alpha": 0.4, "zorder": 1.5} if method == ALL_GIVEN else {})
 
 
 def _label_counts(axes: Axes, at: Float[np.ndarray, " k"], counts: Int[np.ndarray, " k"]) -> None:
@@ -251,12 +253,12 @@ def _calibration(source: Source) -> bytes:
     scores = {i: c for i, c in scores.items() if c.bin_count.any()}
     width = 8.4 / max(len(scores), 1)
     for k, (i, c) in enumerate(scores.items()):
-        some = c.bin_count >= LEAST
-        x, y, n = 100 * c.bin_confidence[some], 100 * c.bin_share[some], c.bin_count[some]
+        few, n = c.bin_count < LEAST, c.bin_count
+        x, y = (np.where(few, np.nan, 100 * part) for part in (c.bin_confidence, c.bin_share))
         axes.plot(x, y, label=f"{shown[i]}  {100 * c.error:.1f} %", **_style(i))
-        axes.scatter(x, y, s=12 + 220 * n / c.bin_count.sum(), color=_style(i)["color"], alpha=0.6, zorder=3)
-        left = 10 * np.arange(len(c.bin_count)) + 0.8 + k * width
-        bars.bar(left, c.bin_count, width * 0.92, align="edge", color=_style(i)["color"])
+        axes.scatter(x, y, s=12 + 220 * n / n.sum(), color=_style(i)["color"], alpha=0.6, zorder=3)
+        left = 10 * np.arange(len(n)) + 0.8 + k * width
+        bars.bar(left, n, width * 0.92, align="edge", color=_style(i)["color"])
     axes.set(ylabel="normals within 30 degrees, %", xlim=(0, 100), ylim=(-3, 103))
     axes.set_title(f"bins with {LEAST} or more hands; dot size: share of the method's hands", fontsize=11)
     axes.text(74, 20, "over-confident", color=_GREY, fontsize=9)

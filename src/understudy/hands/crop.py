@@ -102,9 +102,12 @@ class HandView:
         np.minimum.at(near, cell, depth[inside].clip(max=LIMIT).astype(np.float32))
         return np.stack([near, (near < EMPTY).astype(np.float32)]).reshape(2, CELLS, CELLS)
 
-    def points_near(self, depth: RegisteredDepth) -> Float[np.ndarray, "n 3"]:
-        """The measured points that `depth_crop` needs: those in the crop's part of the image."""
-        part = image_part(depth.camera, self.center, 1.5 * HALF)
+    def points_near(self, depth: RegisteredDepth, margin: float = 0.0) -> Float[np.ndarray, "n 3"]:
+        """The measured points that `depth_crop` needs: those in the crop's part of the image.
+
+        margin: also those that views whose centres are up to so many metres away need.
+        """
+        part = image_part(depth.camera, self.center, 1.5 * HALF + margin)
         z = depth.z[part]
         rays = pixel_rays(depth.camera)[(slice(None), *part)]
         measured = z > 0

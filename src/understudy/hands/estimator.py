@@ -15,13 +15,17 @@ from understudy.errors import ModelFileError, UnderstudyError
 from understudy.hands.color_path import SIDES, ColorPalm, ColorPath
 from understudy.hands.crop import CELL, HandView
 from understudy.hands.nets import HandNets, load_nets
-from understudy.hands.predictor import HandPrediction, HandPredictor, color_word
+from understudy.hands.predictor import HandPrediction, HandPredictor, color_word, pooled
 from understudy.skeleton import JOINT
 from understudy.types import Frame, Hands, Palm, Person, RegisteredFrame
+from understudy.voxels import rotation_to
 
 LEAST_CONFIDENCE: Final = 0.1
 """Palms below are left out."""
 
+_BALL = 1.87  # radius that holds 68 % of a normal distribution in space, in sigmas along an axis
+_SIGMA_LEAST, _SIGMA_MOST = 0.015, 0.12  # metres along an axis: of wrists that are looked for in several places
+_STEP = 1.2  # sigmas from the middle to the other places
 _AGREE = np.radians(35)  # the colour path's joints are used where its normal is so near to the result
 _NEAR = 1.5  # cells: a measurement beside a keypoint
 _BEFORE, _BEHIND = 0.03, 0.05  # metres: a keypoint is supported by a surface from so far before to so far behind it
@@ -33,9 +37,10 @@ class HandNormalEstimator:
 
     1. `HandView`: where the body says that a hand is, how large and how turned; left or right is the body's word.
     2. `ColorPath`: palm detection and hand landmarks on several crops of the colour image (optional).
-    3. `HandView.depth_crop`: the depth around the hand.
+    3. `HandView.depth_crop`: the depth around the hand; several crops, as far apart as the wrist is uncertain.
     4. `HandPredictor`: a network that is told the depth, the body's joints and the colour path's word, trained to weigh
-       them; where the fingers cannot be seen, what the forearm and the posture make likely is left.
+       them; where the fingers cannot be seen, what the forearm and the posture make likely is left. `pooled` joins what
+       it says of the crops.
     """
 
     def __init__(
@@ -71,41 +76,67 @@ class HandNormalEstimator:
         registered = frame if isinstance(frame, RegisteredFrame) else register(frame)
         places = [self._views(registered.camera, person) for person in people]
         words = [self._words(registered, person, views) for person, (views, _) in zip(people, places, strict=True)]
-        flat = [(i, side, view) for i, (views, _) in enumerate(places) for side, view in views.items()]
-        clouds = [view.points_near(registered.depth) for _, _, view in flat]
-        depth = [view.depth_crop(cloud) for (_, _, view), cloud in zip(flat, clouds, strict=True)]
-        color = [color_word(view, words[i].get(side)) for i, side, view in flat]
-        said = self.predictor([view for *_, view in flat], np.stack(depth), np.stack(color)) if flat else []
+        hands = [(i, side, several) for i, (views, _) in enumerate(places) for side, several in views.items()]
+        clouds = [several[0].points_near(registered.depth, _spread(several)) for *_, several in hands]
+        depth = [v.depth_crop(cloud) for (*_, several), cloud in zip(hands, clouds, strict=True) for v in several]
+        color = [color_word(view, words[i].get(side)) for i, side, several in hands for view in several]
+        flat = [view for *_, several in hands for view in several]
+        said = iter(self.predictor(flat, np.stack(depth), np.stack(color)) if flat else [])
         palms: list[dict[str, Palm]] = [{} for _ in people]
-        for (i, side, _), cloud, word in zip(flat, clouds, said, strict=True):
-            why = places[i][1]
+        for (i, side, several), cloud in zip(hands, clouds, strict=True):
+            why, word = places[i][1], pooled([next(said) for _ in several])
             if word.confidence < self.least_confidence:
                 why[side] = f"too unsure: within 30 degrees with a probability of {word.confidence:.2f} only"
             else:
                 palms[i][side] = _palm(registered.camera, word, words[i].get(side), cloud)
         return [Hands(p.get("left"), p.get("right"), why) for p, (_, why) in zip(palms, places, strict=True)]
 
-    def _views(self, camera: Camera, person: Person) -> tuple[dict[str, HandView], dict[str, str]]:
-        """The view of each hand, or why there is none."""
-        views: dict[str, HandView] = {}
+    def _views(self, camera: Camera, person: Person) -> tuple[dict[str, list[HandView]], dict[str, str]]:
+        """The views of each hand, or why there are none."""
+        views: dict[str, list[HandView]] = {}
         why: dict[str, str] = {}
         for side in SIDES:
             if person.failed is not None:
                 why[side] = f"the person has no 3D joints: {person.failed}"
                 continue
-            view = HandView.of(person.keypoints, side)
-            if view is None:
+            several = hypotheses(person, side)
+            if not several:
                 why[side] = "the wrist or the elbow has no 3D position"
             elif not camera.contains(camera.project(person.keypoints[[JOINT[f"{side}_wrist"]]])).all():
                 why[side] = "the wrist is outside the colour image"
             else:
-                views[side] = view
+                views[side] = several
         return views, why
 
-    def _words(self, frame: RegisteredFrame, person: Person, views: dict[str, HandView]) -> dict[str, ColorPalm | None]:
+    def _words(
+        self, frame: RegisteredFrame, person: Person, views: dict[str, list[HandView]]
+    ) -> dict[str, ColorPalm | None]:
         if self.color_path is None or not views:
             return {}
         return self.color_path.estimate(frame, person)
+
+
+def hypotheses(person: Person, side: str) -> list[HandView]:
+    """Views of where a hand may be: where the wrist is believed to be, then to both sides of it along the view and
+    across, as far as its sigma says; a wrist that is known well enough has the first only. None without an arm.
+    """
+    row = JOINT[f"{side}_wrist"]
+    first = HandView.of(person.keypoints, side)
+    if first is None:
+        return []
+    sigma = min(float(np.nan_to_num(person.sigma_m[row], nan=_SIGMA_MOST)) / _BALL, _SIGMA_MOST)
+    if sigma < _SIGMA_LEAST:
+        return [first]
+    ray = person.keypoints[row] / np.linalg.norm(person.keypoints[row])
+    steps = _STEP * sigma * np.array([sign * axis for axis in rotation_to(ray) for sign in (-1, 1)])
+    moved = np.repeat(person.keypoints[None], len(steps), axis=0)
+    moved[:, row] += steps
+    return [first, *(view for joints in moved if (view := HandView.of(joints, side)) is not None)]
+
+
+def _spread(views: Sequence[HandView]) -> float:
+    """Metres: how far the views' centres are from the first one's."""
+    return float(max(np.linalg.norm(view.center - views[0].center) for view in views))
 
 
 def _palm(camera: Camera, word: HandPrediction, color: ColorPalm | None, cloud: Float[np.ndarray, "n 3"]) -> Palm:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import resources
 from pathlib import Path
 from typing import Final
@@ -19,6 +19,7 @@ from understudy.hands.crop import HandView
 WEIGHTS: Final = "handnormalnet.onnx"
 _OUTPUTS = ("normal", "direction", "log_kappa", "landmarks", "sure")
 _LEAST_SPREAD = 0.01  # radians
+_DISAGREE = 0.8  # radians: predictions that differ by so much are hardly evidence for each other
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,6 +73,28 @@ class HandPredictor:
             )
             for i, view in enumerate(views)
         ]
+
+
+def pooled(words: Sequence[HandPrediction]) -> HandPrediction:
+    """One prediction from those of several places where a hand may be: each counts as much as it is sure, and where
+    they disagree the result is less sure. The landmarks are those of the prediction that fits the result best.
+    """
+    if len(words) == 1:
+        return words[0]
+    sure = np.array([word.confidence for word in words])
+    weight = np.maximum(sure, 1e-6) / np.maximum(sure, 1e-6).sum()
+    normals = np.stack([word.normal for word in words])
+    normal, direction = (_mean_direction(v, weight) for v in (normals, np.stack([w.direction for w in words])))
+    agreement = np.exp(-((np.arccos(np.clip(normals @ normal, -1, 1)) / _DISAGREE) ** 2))
+    best = words[int(np.argmax(sure * agreement))]
+    return replace(best, normal=normal, direction=direction, confidence=float(weight @ (sure * agreement)))
+
+
+def _mean_direction(vectors: Float[np.ndarray, "n 3"], weight: Float[np.ndarray, " n"]) -> Float[np.ndarray, "3"]:
+    mean = weight @ vectors
+    length = np.linalg.norm(mean)
+    unit: np.ndarray = mean / length if length > 1e-6 else vectors[int(np.argmax(weight))]
+    return unit
 
 
 def color_word(view: HandView, palm: ColorPalm | None) -> Float32[np.ndarray, "9"]:
