@@ -1,5 +1,7 @@
 """Palms: laws of the hand's view, the network in use, reasons why there is no palm; and what the method reaches."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -12,8 +14,8 @@ from understudy.hands import HandNormalEstimator
 from understudy.hands import estimator as hands_module
 from understudy.hands.color_path import ColorPalm
 from understudy.hands.crop import CELL, CELLS, EMPTY, HALF, LIMIT, HandView, arm_context, crop_rotation
-from understudy.hands.estimator import supported
-from understudy.hands.predictor import HandPredictor, color_word
+from understudy.hands.estimator import hypotheses, supported
+from understudy.hands.predictor import HandPrediction, HandPredictor, color_word, pooled
 from understudy.skeleton import JOINT, N_JOINTS
 from understudy.types import Keypoints2D, Person, RegisteredDepth, RegisteredFrame
 
@@ -253,6 +255,41 @@ def test_exported_network_says_what_torch_says() -> None:
         np.testing.assert_allclose(view.directions_from_cam(word.normal), out.normal[k].numpy(), atol=1e-3)
         np.testing.assert_allclose((word.landmarks - view.center) @ view.R.T, out.landmarks[k].numpy(), atol=1e-3)
         assert word.confidence == pytest.approx(float(out.sure[k].sigmoid()), abs=1e-3)
+
+
+def _word(normal: list[float], confidence: float) -> HandPrediction:
+    unit = np.array(normal) / np.linalg.norm(normal)
+    return HandPrediction(unit, np.array([1.0, 0, 0]), np.full((21, 3), confidence), np.ones(2), confidence)
+
+
+def test_pooling_believes_the_sure_and_doubts_disagreement() -> None:
+    one = _word([0, 0, 1], 0.8)
+    assert pooled([one]) is one
+    same = pooled([one, one, one])
+    assert same.confidence == pytest.approx(0.8)
+    np.testing.assert_allclose(same.normal, one.normal)
+    other = pooled([one, _word([0, 1, 0], 0.2)])
+    assert other.normal @ one.normal > 0.95 and other.confidence < 0.7
+    np.testing.assert_array_equal(other.landmarks, one.landmarks)
+    opposite = pooled([one, _word([0, 0, -1], 0.8)])
+    assert np.isfinite(opposite.normal).all() and opposite.confidence < 0.5
+
+
+def test_hand_is_looked_for_as_far_as_the_wrist_is_uncertain() -> None:
+    joints = skeleton(7) - [0.2, 0, 0]
+    known, unknown, lost = (replace(person(joints), sigma_m=np.full(N_JOINTS, s)) for s in (0.02, 0.15, 5.0))
+    assert len(hypotheses(known, "left")) == 1
+    several = hypotheses(unknown, "left")
+    assert len(several) == 7
+    wrists = np.stack([view.to_cam(view.context)[0] for view in several])
+    np.testing.assert_allclose(wrists[0], joints[JOINT["left_wrist"]])
+    np.testing.assert_allclose(wrists[1:].mean(axis=0), wrists[0], atol=1e-9)
+    np.testing.assert_allclose(np.linalg.norm(wrists[1:] - wrists[0], axis=1), 1.2 * 0.15 / 1.87, rtol=1e-6)
+    far = np.stack([view.to_cam(view.context)[0] for view in hypotheses(lost, "left")])
+    assert np.linalg.norm(far - far[0], axis=1).max() < 0.2
+    no_arm = joints.copy()
+    no_arm[JOINT["left_wrist"]] = np.nan
+    assert hypotheses(person(no_arm), "left") == []
 
 
 # -- what it reaches -----------------------------------------------------------------------------------------------
