@@ -6,6 +6,7 @@ A flat, dim or half hidden hand shows as crops that disagree.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -160,13 +161,15 @@ def jittered(region: Region, n: int) -> list[Region]:
 class ColorPath:
     """Palm normals of a person from the colour image."""
 
-    def __init__(self, nets: HandNets, crops: int = 4, min_presence: float = 0.5):
+    def __init__(self, nets: HandNets, crops: int = 2, min_presence: float = 0.5):
         """crops: of each hand, half of them mirrored. min_presence: least probability that a crop holds a hand."""
         self.crops, self.min_presence, self._nets = crops, min_presence, nets
 
-    def estimate(self, frame: RegisteredFrame, person: Person) -> dict[str, ColorPalm | None]:
-        """'left', 'right' -> palm; None where no hand was found at the wrist."""
-        places = {side: hand_place(frame.camera, person, side) for side in SIDES}
+    def estimate(
+        self, frame: RegisteredFrame, person: Person, sides: Sequence[str] = SIDES
+    ) -> dict[str, ColorPalm | None]:
+        """'left', 'right' -> palm; None where no hand was found at the wrist, or none was looked for (`sides`)."""
+        places = {side: hand_place(frame.camera, person, side) for side in sides}
         regions = self._regions(frame, {side: place for side, place in places.items() if place is not None})
         jitter = {side: jittered(region, self.crops) for side, region in regions.items()}
         looks = self._looks(frame, [region for side in jitter for region in jitter[side]])

@@ -17,15 +17,16 @@ from understudy.hands.crop import CELL, HandView
 from understudy.hands.nets import HandNets, load_nets
 from understudy.hands.predictor import HandPrediction, HandPredictor, color_word, pooled
 from understudy.skeleton import JOINT
-from understudy.types import Frame, Hands, Palm, Person, RegisteredFrame
+from understudy.types import OBSERVED, Frame, Hands, Palm, Person, RegisteredFrame
 from understudy.voxels import rotation_to
 
-LEAST_CONFIDENCE: Final = 0.1
+LEAST_CONFIDENCE: Final = 0.2
 """Palms below are left out."""
 
 _BALL = 1.87  # radius that holds 68 % of a normal distribution in space, in sigmas along an axis
-_SIGMA_LEAST, _SIGMA_MOST = 0.015, 0.12  # metres along an axis: of wrists that are looked for in several places
-_STEP = 1.2  # sigmas from the middle to the other places
+_SIGMA_LEAST, _SIGMA_MOST = 0.03, 0.12  # metres along an axis: of wrists that are looked for in several places
+_STEP = 1.5  # sigmas from the middle to the other places
+_TETRAHEDRON = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / np.sqrt(3)  # across, down, along the view
 _AGREE = np.radians(35)  # the colour path's joints are used where its normal is so near to the result
 _NEAR = 1.5  # cells: a measurement beside a keypoint
 _BEFORE, _BEHIND = 0.03, 0.05  # metres: a keypoint is supported by a surface from so far before to so far behind it
@@ -36,7 +37,7 @@ class HandNormalEstimator:
     """Which way the palms of an estimated person face, in the colour camera's frame.
 
     1. `HandView`: where the body says that a hand is, how large and how turned; left or right is the body's word.
-    2. `ColorPath`: palm detection and hand landmarks on several crops of the colour image (optional).
+    2. `ColorPath`: palm detection and hand landmarks on crops of the colour image, where the wrist is seen (optional).
     3. `HandView.depth_crop`: the depth around the hand; several crops, as far apart as the wrist is uncertain.
     4. `HandPredictor`: a network that is told the depth, the body's joints and the colour path's word, trained to weigh
        them; where the fingers cannot be seen, what the forearm and the posture make likely is left. `pooled` joins what
@@ -113,12 +114,13 @@ class HandNormalEstimator:
     ) -> dict[str, ColorPalm | None]:
         if self.color_path is None or not views:
             return {}
-        return self.color_path.estimate(frame, person)
+        seen = [side for side in views if person.source[JOINT[f"{side}_wrist"]] == OBSERVED]
+        return self.color_path.estimate(frame, person, seen)
 
 
 def hypotheses(person: Person, side: str) -> list[HandView]:
-    """Views of where a hand may be: where the wrist is believed to be, then to both sides of it along the view and
-    across, as far as its sigma says; a wrist that is known well enough has the first only. None without an arm.
+    """Views of where a hand may be: where the wrist is believed to be, then at the corners of a tetrahedron around it,
+    as large as its sigma says; a wrist that is known well enough has the first only. None without an arm.
     """
     row = JOINT[f"{side}_wrist"]
     first = HandView.of(person.keypoints, side)
@@ -127,8 +129,9 @@ def hypotheses(person: Person, side: str) -> list[HandView]:
     sigma = min(float(np.nan_to_num(person.sigma_m[row], nan=_SIGMA_MOST)) / _BALL, _SIGMA_MOST)
     if sigma < _SIGMA_LEAST:
         return [first]
-    ray = person.keypoints[row] / np.linalg.norm(person.keypoints[row])
-    steps = _STEP * sigma * np.array([sign * axis for axis in rotation_to(ray) for sign in (-1, 1)])
+    mirror = np.array([1.0 if side == "right" else -1.0, 1.0, 1.0])  # of left hands, as in the views
+    ray = mirror * person.keypoints[row] / np.linalg.norm(person.keypoints[row])
+    steps = _STEP * sigma * _TETRAHEDRON @ rotation_to(ray) * mirror
     moved = np.repeat(person.keypoints[None], len(steps), axis=0)
     moved[:, row] += steps
     return [first, *(view for joints in moved if (view := HandView.of(joints, side)) is not None)]
