@@ -128,10 +128,11 @@ def test_no_view_without_an_arm() -> None:
 
 
 def test_support_needs_a_surface_at_the_right_depth() -> None:
-    marks = np.array([[0.0, 0, 2.0], [0.1, 0, 2.0], [0.2, 0, 2.0]])
-    cloud = np.array([[0.0, 0, 1.98], [0.1, 0, 1.6], [0.24, 0, 2.0]])
-    assert supported(marks, cloud).tolist() == [True, False, False]
-    assert not supported(marks, np.zeros((0, 3))).any()
+    view = HandView.of(skeleton(), "left")
+    marks = view.to_cam(np.array([[0.0, 0, 0], [0.1, 0, 0], [-0.1, 0, 0], [0.0, 0.5, 0]]))
+    cloud = view.to_cam(np.array([[0.0, 0.005, -0.01], [0.1, 0, -0.15], [-0.05, 0, 0]]))
+    assert supported(view, view.depth_crop(cloud), marks).tolist() == [True, False, False, False]
+    assert not supported(view, view.depth_crop(np.zeros((0, 3))), marks).any()
 
 
 def test_color_word_is_in_the_view() -> None:

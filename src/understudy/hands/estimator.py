@@ -4,20 +4,21 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Float32
 
 from understudy.camera import Camera
 from understudy.errors import ModelFileError, UnderstudyError
 from understudy.hands.color_path import SIDES, ColorPalm, ColorPath
-from understudy.hands.crop import CELL, HandView
+from understudy.hands.crop import CELL, CELLS, EMPTY, HandView
 from understudy.hands.nets import HandNets, load_nets
 from understudy.hands.predictor import HandPrediction, HandPredictor, color_word, pooled
 from understudy.skeleton import JOINT
-from understudy.types import OBSERVED, Frame, Hands, Palm, Person, RegisteredFrame
+from understudy.types import OBSERVED, Frame, Hands, Palm, Person, RegisteredDepth, RegisteredFrame
 from understudy.voxels import rotation_to
 
 LEAST_CONFIDENCE: Final = 0.2
@@ -28,7 +29,7 @@ _SIGMA_LEAST, _SIGMA_MOST = 0.03, 0.12  # metres along an axis: of wrists that a
 _STEP = 1.5  # sigmas from the middle to the other places
 _TETRAHEDRON = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / np.sqrt(3)  # across, down, along the view
 _AGREE = np.radians(35)  # the colour path's joints are used where its normal is so near to the result
-_NEAR = 1.5  # cells: a measurement beside a keypoint
+_NEIGHBOURS = np.arange(3)  # cells around a keypoint's, in a crop with a rim
 _BEFORE, _BEHIND = 0.03, 0.05  # metres: a keypoint is supported by a surface from so far before to so far behind it
 _PROJECTED_SCORE = 0.5  # of a 2D keypoint that is a projected 3D one, times the confidence
 
@@ -77,20 +78,30 @@ class HandNormalEstimator:
         registered = frame if isinstance(frame, RegisteredFrame) else register(frame)
         places = [self._views(registered.camera, person) for person in people]
         words = [self._words(registered, person, views) for person, (views, _) in zip(people, places, strict=True)]
-        hands = [(i, side, several) for i, (views, _) in enumerate(places) for side, several in views.items()]
-        clouds = [several[0].points_near(registered.depth, _spread(several)) for *_, several in hands]
-        depth = [v.depth_crop(cloud) for (*_, several), cloud in zip(hands, clouds, strict=True) for v in several]
-        color = [color_word(view, words[i].get(side)) for i, side, several in hands for view in several]
-        flat = [view for *_, several in hands for view in several]
-        said = iter(self.predictor(flat, np.stack(depth), np.stack(color)) if flat else [])
+        hands = [
+            _Hand(i, side, several, np.stack(_crops(registered.depth, several)), words[i].get(side))
+            for i, (views, _) in enumerate(places)
+            for side, several in views.items()
+        ]
+        said = iter(self._predict(hands))
         palms: list[dict[str, Palm]] = [{} for _ in people]
-        for (i, side, several), cloud in zip(hands, clouds, strict=True):
-            why, word = places[i][1], pooled([next(said) for _ in several])
+        for hand in hands:
+            word = pooled([next(said) for _ in hand.views])
             if word.confidence < self.least_confidence:
-                why[side] = f"too unsure: within 30 degrees with a probability of {word.confidence:.2f} only"
+                why = f"too unsure: within 30 degrees with a probability of {word.confidence:.2f} only"
+                places[hand.person][1][hand.side] = why
             else:
-                palms[i][side] = _palm(registered.camera, word, words[i].get(side), cloud)
+                palms[hand.person][hand.side] = hand.palm(registered.camera, word)
         return [Hands(p.get("left"), p.get("right"), why) for p, (_, why) in zip(palms, places, strict=True)]
+
+    def _predict(self, hands: Sequence[_Hand]) -> list[HandPrediction]:
+        """Of all views of all hands."""
+        if not hands:
+            return []
+        color = np.stack([color_word(view, hand.color) for hand in hands for view in hand.views])
+        return self.predictor(
+            [v for hand in hands for v in hand.views], np.concatenate([h.crops for h in hands]), color
+        )
 
     def _views(self, camera: Camera, person: Person) -> tuple[dict[str, list[HandView]], dict[str, str]]:
         """The views of each hand, or why there are none."""
@@ -137,26 +148,47 @@ def hypotheses(person: Person, side: str) -> list[HandView]:
     return [first, *(view for joints in moved if (view := HandView.of(joints, side)) is not None)]
 
 
-def _spread(views: Sequence[HandView]) -> float:
-    """Metres: how far the views' centres are from the first one's."""
-    return float(max(np.linalg.norm(view.center - views[0].center) for view in views))
+def _crops(depth: RegisteredDepth, views: Sequence[HandView]) -> list[Float32[np.ndarray, "2 48 48"]]:
+    """The depth crops of several views of one hand."""
+    apart = max(float(np.linalg.norm(view.center - views[0].center)) for view in views)
+    cloud = views[0].points_near(depth, apart)
+    return [view.depth_crop(cloud) for view in views]
 
 
-def _palm(camera: Camera, word: HandPrediction, color: ColorPalm | None, cloud: Float[np.ndarray, "n 3"]) -> Palm:
-    projected = np.nan_to_num(camera.project(word.landmarks))
-    inside = camera.contains(projected)
-    keypoints_2d = np.column_stack([projected, np.where(inside, _PROJECTED_SCORE * word.confidence, 0.0)])
-    if color is not None and np.arccos(np.clip(color.normal @ word.normal, -1, 1)) < _AGREE:
-        keypoints_2d = color.keypoints_2d
-    keypoints = np.where(supported(word.landmarks, cloud)[:, None], word.landmarks, np.nan)
-    return Palm(word.normal, word.confidence, word.direction, keypoints, keypoints_2d)
+@dataclass(frozen=True, eq=False)
+class _Hand:
+    """One hand that is looked at."""
+
+    person: int
+    """number in the list of people"""
+    side: str
+    views: list[HandView]
+    crops: Float32[np.ndarray, "n 2 48 48"]
+    color: ColorPalm | None
+
+    def palm(self, camera: Camera, word: HandPrediction) -> Palm:
+        """The result, from the pooled prediction."""
+        projected = np.nan_to_num(camera.project(word.landmarks))
+        score = np.where(camera.contains(projected), _PROJECTED_SCORE * word.confidence, 0.0)
+        keypoints_2d = np.column_stack([projected, score])
+        if self.color is not None and np.arccos(np.clip(self.color.normal @ word.normal, -1, 1)) < _AGREE:
+            keypoints_2d = self.color.keypoints_2d
+        there = supported(self.views[0], self.crops[0], word.landmarks)
+        keypoints = np.where(there[:, None], word.landmarks, np.nan)
+        return Palm(word.normal, word.confidence, word.direction, keypoints, keypoints_2d)
 
 
-def supported(landmarks: Float[np.ndarray, "n 3"], cloud: Float[np.ndarray, "m 3"]) -> np.ndarray:
-    """Which keypoints have a measured surface beside them (seen from the camera) at about their depth; bool (n,)."""
-    if not len(cloud):
-        return np.zeros(len(landmarks), bool)
-    apart = np.abs(landmarks[:, None, :2] / landmarks[:, None, 2:] - cloud[:, :2] / cloud[:, 2:]).max(axis=2)
-    beside = apart * landmarks[:, 2:] < _NEAR * CELL
-    behind = cloud[:, 2] - landmarks[:, None, 2]
-    return (beside & (behind > -_BEFORE) & (behind < _BEHIND)).any(axis=1)
+def supported(view: HandView, crop: Float32[np.ndarray, "2 48 48"], landmarks: Float[np.ndarray, "n 3"]) -> np.ndarray:
+    """Which keypoints (metres, colour camera's frame) have a measured surface in front of them or beside them, at about
+    their depth; bool (n,). crop: `view.depth_crop`.
+    """
+    x, y, z = ((landmarks - view.center) @ view.R.T).T
+    scale = view.distance / CELL / np.maximum(z + view.distance, CELL)
+    cell = np.floor(np.stack([y, x]) * scale + CELLS / 2).astype(int)
+    near = np.pad(crop[0], 1, constant_values=EMPTY)
+    row, column = np.clip(cell, 0, CELLS - 1)
+    around = near[(row[:, None, None] + _NEIGHBOURS[:, None]), (column[:, None, None] + _NEIGHBOURS)]
+    behind = around.reshape(len(landmarks), -1) - z[:, None]
+    inside = ((cell >= 0) & (cell < CELLS)).all(axis=0)
+    found: np.ndarray = inside & ((behind > -_BEFORE) & (behind < _BEHIND)).any(axis=1)
+    return found
