@@ -121,7 +121,7 @@ side of the hand is seen by the depth camera; *hidden*: less than a fifth; *grip
 
 ## Limits
 
-Trained on simulation only: adults, bare hands, 1 to 6 m from the camera. From the depth alone a flat hand's palm and
+Trained on simulation only: adults, bare hands, 0.6 to 6 m from the camera. From the depth alone a flat hand's palm and
 back look alike beyond about 2 m; then the arm's posture and the colour decide. A hidden hand's normal is a guess from
 the posture, and the confidence says so.
 
