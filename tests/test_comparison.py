@@ -201,11 +201,12 @@ def test_a_recording_without_detections_is_refused(flat_frame, tmp_path):
 
 def test_the_page_and_its_plots(group, tmp_path):
     pytest.importorskip("matplotlib")
-    write_report(tmp_path, [group], Trainings(("anny",), ("kitchen",), ("capsules: left out",)), ["mlp: left out"])
+    trainings = Trainings(("anny",), ("kitchen",), ("capsules: left out",), {"anny": 5120})
+    write_report(tmp_path, [group], trainings, ["mlp: left out"])
     page = (tmp_path / "README.md").read_text()
     good, some = (17 * 0.95 + 18 * 0.4) / 35, (17 * 0.9 + 16 * 0.6) / 35
-    assert f"| anny | {good:.3f} (6.7) |" in page
-    assert f"| kitchen, Kitchen | {some:.3f} (4.9) | {good:.3f} (6.7) |" in page
+    assert f"| anny | 5,120 | {good:.3f} (6.7) |" in page and "These runs are shorter" in page
+    assert f"| kitchen, Kitchen | - | {some:.3f} (4.9) | {good:.3f} (6.7) |" in page
     assert "- mlp: left out\n- capsules: left out" in page and "Not detected: 1 people" in page
     assert f"| {OURS} on true 2D |" in page
     for name in PLOTS:

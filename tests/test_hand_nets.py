@@ -211,7 +211,7 @@ BODY = person({"right_wrist": (0, 0.06, 1.5), "right_elbow": (0, 0.31, 1.5)})
 def test_looks_that_agree_win():
     """Three palms to the camera and a back: the palm, with the back in the spread."""
     palm, back = look_at(right_hand(), AT), look_at(right_hand() * (-1, 1, -1), AT)
-    found = ColorPath(PerfectNets([palm, back, palm, palm])).estimate(frame_of(BLACK), BODY)
+    found = ColorPath(PerfectNets([palm, back, palm, palm]), crops=4).estimate(frame_of(BLACK), BODY)
     assert found["left"] is None
     hand = found["right"]
     np.testing.assert_allclose(hand.normal, (0, 0, -1), atol=1e-6)
@@ -226,7 +226,7 @@ def test_looks_that_saw_something_else_do_not_count():
     palm = look_at(right_hand(), AT)
     elsewhere = look_at(right_hand(), AT + (0.3, 0, 0))
     nothing = look_at(right_hand(), AT, presence=0.4)
-    found = ColorPath(PerfectNets([palm, elsewhere, nothing, palm])).estimate(frame_of(BLACK), BODY)
+    found = ColorPath(PerfectNets([palm, elsewhere, nothing, palm]), crops=4).estimate(frame_of(BLACK), BODY)
     assert found["right"].share == 0.5 and found["right"].spread == pytest.approx(0, abs=1e-6)
     assert ColorPath(PerfectNets([elsewhere, nothing] * 2)).estimate(frame_of(BLACK), BODY)["right"] is None
     assert ColorPath(PerfectNets([palm] * 4, palms=False)).estimate(frame_of(BLACK), BODY)["right"] is None

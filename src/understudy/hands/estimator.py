@@ -21,7 +21,7 @@ from understudy.skeleton import JOINT
 from understudy.types import OBSERVED, Frame, Hands, Palm, Person, RegisteredDepth, RegisteredFrame
 from understudy.voxels import rotation_to
 
-LEAST_CONFIDENCE: Final = 0.2
+LEAST_CONFIDENCE: Final = 0.18
 """Palms below are left out."""
 
 _BALL = 1.87  # radius that holds 68 % of a normal distribution in space, in sigmas along an axis
