@@ -12,7 +12,6 @@ from understudy.detectors.blazepose_nets import Region
 from understudy.geometry import angle_between
 from understudy.hands.color_path import (
     ColorPath,
-    _turn_to,
     body_scale,
     hand_place,
     hand_shape,
@@ -35,6 +34,7 @@ from understudy.hands.nets import (
 from understudy.registration import register
 from understudy.skeleton import FLIP, JOINT, N_JOINTS
 from understudy.types import OBSERVED, Keypoints2D, Person, RegisteredDepth, RegisteredFrame
+from understudy.voxels import rotation_to
 
 CAMERA = Camera(960, 540, np.array([[540.7, 0, 479.5], [0, 540.7, 269.5], [0, 0, 1.0]]))
 
@@ -166,7 +166,7 @@ unit = st.tuples(*[st.floats(-1, 1)] * 3).map(np.array).filter(lambda v: np.lina
 
 def look_at(shape: np.ndarray, at: np.ndarray, side: str = "right", presence: float = 0.9, unit: float = 1.0):
     """What perfect networks say of a hand at a point (metres)."""
-    view = shape @ _turn_to(at)
+    view = shape @ rotation_to(at / np.linalg.norm(at)).T
     metre = CAMERA.fx / at[2]
     palm = view[[WRIST, INDEX, PINKY]].mean(0)
     uv = CAMERA.project(at) + (view - palm)[:, :2] * metre

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from understudy import detectors
 from understudy.camera import Camera
 from understudy.errors import RecordingError
-from understudy.hands.color_path import SIDES, ColorPath, _turn_to, hand_place, palm_normal
+from understudy.hands.color_path import SIDES, ColorPath, hand_place, palm_normal
 from understudy.hands.estimator import HandNormalEstimator
 from understudy.hands.nets import HAND_SIZE, INDEX, PINKY, WRIST, HandNets
 from understudy.metrics.joints import median
@@ -23,6 +23,7 @@ from understudy.recordings.truth import TruthPerson
 from understudy.registration import register
 from understudy.skeleton import JOINT, N_JOINTS
 from understudy.types import Palm, Person, RegisteredDepth, RegisteredFrame
+from understudy.voxels import rotation_to
 
 if TYPE_CHECKING:
     pass
@@ -141,7 +142,7 @@ def papers_way(nets: HandNets) -> HandMethod:
             region = replace(place.window, size=_PAPER_CROP * place.scale * place.metre)
             (look,) = nets.landmarks([region.crop(frame.color, HAND_SIZE)], [region])
             ray = frame.camera.unproject(look.uv[[WRIST, INDEX, PINKY]].mean(0), 1.0)
-            normal = palm_normal(look.world @ _turn_to(ray).T, side)
+            normal = palm_normal(look.world @ rotation_to(ray / np.linalg.norm(ray)), side)
             if np.isfinite(normal).all():
                 out[side] = Palm(normal, float("nan"))
         return out

@@ -31,6 +31,7 @@ from understudy.hands.nets import (
 )
 from understudy.skeleton import JOINT
 from understudy.types import Person, RegisteredFrame
+from understudy.voxels import rotation_to
 
 SIDES: Final = ("left", "right")
 
@@ -242,20 +243,13 @@ def hand_shape(camera: Camera, look: HandLandmarks, metres_per_pixel: float) -> 
     pixels_per_unit = np.sqrt((uv**2).sum() / max((world**2).sum(), 1e-12))
     points = np.column_stack([look.uv, look.world[:, 2] * pixels_per_unit]) * metres_per_pixel
     ray = camera.unproject(look.uv[[WRIST, INDEX, PINKY]].mean(0), 1.0)
-    return (points - points[WRIST]) @ _turn_to(ray).T
+    return (points - points[WRIST]) @ rotation_to(_unit(ray))
 
 
 def palm_normal(shape: Float[np.ndarray, "*n 21 3"], side: str) -> Float[np.ndarray, "*n 3"]:
     """Unit normal out of the palm of a hand's joints."""
     across = np.cross(shape[..., INDEX, :] - shape[..., WRIST, :], shape[..., PINKY, :] - shape[..., WRIST, :])
     return _unit(across if side == "right" else -across)
-
-
-def _turn_to(ray: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """The smallest rotation that takes the z axis to a ray (which points away from the camera)."""
-    x, y, z = _unit(ray)
-    k = 1 / (1 + z)
-    return np.array([[1 - k * x * x, -k * x * y, x], [-k * x * y, 1 - k * y * y, y], [-x, -y, z]])
 
 
 def _angles(a: Float[np.ndarray, "n 3"], b: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, "n m"]:

@@ -17,6 +17,7 @@ from understudy.hands.color_path import SIDES, ColorPalm, ColorPath
 from understudy.hands.crop import CELL, CELLS, EMPTY, HandView
 from understudy.hands.nets import HandNets, load_nets
 from understudy.hands.predictor import HandPrediction, HandPredictor, color_word, pooled
+from understudy.registration import register
 from understudy.skeleton import JOINT
 from understudy.types import OBSERVED, Frame, Hands, Palm, Person, RegisteredDepth, RegisteredFrame
 from understudy.voxels import rotation_to
@@ -73,8 +74,6 @@ class HandNormalEstimator:
 
     def estimate_all(self, frame: Frame | RegisteredFrame, people: Sequence[Person]) -> list[Hands]:
         """The hands of several people of one frame."""
-        from understudy.registration import register
-
         registered = frame if isinstance(frame, RegisteredFrame) else register(frame)
         places = [self._views(registered.camera, person) for person in people]
         words = [self._words(registered, person, views) for person, (views, _) in zip(people, places, strict=True)]
