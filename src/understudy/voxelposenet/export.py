@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,28 +20,40 @@ _LARGE = 256  # numbers: what is stored in half precision
 
 
 def export_onnx(net: VoxelPoseNet, path: Path, half: bool = True) -> None:
-    """Writes the network as ONNX, for any number of people at once.
+    """Writes the network as ONNX, for any number of people at once. half: see `write_onnx`."""
+    example = (torch.rand(2, 2, CELLS, CELLS), torch.rand(2, 18, 3), torch.full((2, 1), 3.0))
+    write_onnx(net, example, INPUTS, OUTPUTS, path, half)
 
-    half: store the weights as float16 (half the size); runtimes compute in float32 all the same.
+
+def write_onnx(
+    net: torch.nn.Module,
+    example: tuple[torch.Tensor, ...],
+    inputs: Sequence[str],
+    outputs: Sequence[str],
+    path: Path,
+    half: bool = True,
+) -> None:
+    """Writes a network as ONNX; the first axis of every input and output may have any length.
+
+    example: inputs. half: store the weights as float16 (half the size); runtimes compute in float32 all the same.
     """
     import onnx
 
-    example = (torch.rand(2, 2, CELLS, CELLS), torch.rand(2, 18, 3), torch.full((2, 1), 3.0))
     buffer: Any = io.BytesIO()  # the exporter's annotation knows paths only
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the exporter's own deprecation and tracing notes
         torch.onnx.export(
-            net.eval(), example, buffer, input_names=list(INPUTS), output_names=list(OUTPUTS),
-            dynamic_axes={name: {0: "people"} for name in (*INPUTS, *OUTPUTS)}, dynamo=False, opset_version=17,
+            net.eval(), example, buffer, input_names=list(inputs), output_names=list(outputs),
+            dynamic_axes={name: {0: "rows"} for name in (*inputs, *outputs)}, dynamo=False, opset_version=17,
         )  # fmt: skip
     model = onnx.load_from_string(buffer.getvalue())
     if half:
-        halve(model.graph)
+        _halve(model.graph)
     onnx.checker.check_model(model)
     write_atomically(path, model.SerializeToString())
 
 
-def halve(graph: object) -> None:
+def _halve(graph: object) -> None:
     """Every large float32 constant becomes float16, followed by a cast back, which runtimes carry out when loading."""
     from onnx import TensorProto, helper, numpy_helper
 
