@@ -1,0 +1,1 @@
+"""The manipulated object: how it can move, and where it is."""
