@@ -19,7 +19,7 @@ from understudy.cli import synth  # noqa: E402
 from understudy.errors import MissingExtraError, RecordingError, UnderstudyError  # noqa: E402
 from understudy.registration import register  # noqa: E402
 from understudy.skeleton import FLIP, JOINT, JOINTS, rows  # noqa: E402
-from understudy.synthetic import actors, recording, render, samples, stage, surfels, timing, view  # noqa: E402
+from understudy.synthetic import actors, recording, render, room, samples, surfels, timing, view  # noqa: E402
 from understudy.synthetic.bodies import capsule_bank  # noqa: E402
 from understudy.synthetic.detections import DetectorConfig, detect  # noqa: E402
 from understudy.synthetic.draw import Draw  # noqa: E402
@@ -457,7 +457,7 @@ def test_the_same_seed_writes_the_same_files(bank, written, tmp_path):
 
 def test_a_box_in_front_hides_exactly_what_is_behind_it(bank):
     studio = Studio(1, 6, RecordingConfig(people=1, scene=replace(OPEN, furniture=0)), bank)
-    made = studio._stage(studio._draw(9), 1)
+    made = studio._room(studio._draw(9), 1)
     moments = made.moments(0)
     R, center = made.cameras.R_cam_world[0], made.cameras.center[0]
     joints = moments[0].joints
@@ -467,7 +467,7 @@ def test_a_box_in_front_hides_exactly_what_is_behind_it(bank):
     flags = []
     for boxes in (nothing, board):
         here = replace(made, boxes=boxes)
-        seen = stage.look(here, moments, studio.raw_camera.color, R, center)
+        seen = room.look(here, moments, studio.raw_camera.color, R, center)
         truth = recording._truth(
             0, made.cameras.to_cam(joints[None])[0], moments[0], here, seen, studio.raw_camera.color
         )

@@ -32,12 +32,16 @@ class OccupancyMap:
 
 @dataclass(frozen=True)
 class Segments:
-    """reach = samples [0, grasp), manipulate = [grasp, release), release = [release, t)."""
+    """reach = samples [0, grasp), manipulate = [grasp, release), release = [release, t).
+
+    The object moves while it is manipulated (pauses included), and only then: `segments.MOVING` says from which
+    speed of the handle on.
+    """
 
     grasp: int
-    """first sample at which the hand holds the object to move it"""
+    """first sample of the motion"""
     release: int
-    """first sample at which it has let go"""
+    """first sample after it, or, if that is earlier, first one at which the hand has left the object"""
 
     def __post_init__(self) -> None:
         if not 0 <= self.grasp < self.release:
@@ -78,6 +82,8 @@ class Demonstration:
     """of the colour camera"""
     joints: Float[np.ndarray, "t 18 3"]
     """the person's joints, world; NaN where nothing is known"""
+    part: Float32[np.ndarray, "m 3"] = field(default_factory=lambda: np.zeros((0, 3), np.float32))
+    """points of the moving part's surface, as far as it was seen; in the handle's frame"""
     source: dict[str, Any] = field(default_factory=dict)
     """where it is from: recording, methods, version"""
 

@@ -33,10 +33,10 @@ from understudy.synthetic.actors import Moment, Motions, make_actor
 from understudy.synthetic.bodies import BodyBank, load_bank
 from understudy.synthetic.detections import DetectorConfig, detect
 from understudy.synthetic.draw import Draw
+from understudy.synthetic.room import Room, View, look, make_room, shade
 from understudy.synthetic.samples import FROM_BEHIND, LEAST_SEEN, hidden_joints
 from understudy.synthetic.scene import SceneConfig
 from understudy.synthetic.sensors import Rig
-from understudy.synthetic.stage import Stage, View, look, make_stage, shade
 from understudy.synthetic.surfels import neighbours
 from understudy.types import Frame, Keypoints2D
 
@@ -156,12 +156,12 @@ class Studio:
         self.raw_camera = _cameras(draw, self.config.sensor, self.rig)
         registered = RGBDCamera.aligned(self.raw_camera.color)
         self.camera = registered if self.config.registered else self.raw_camera
-        self._sequence = self._stage(self._draw(1), frames) if self.config.sequence else None
+        self._sequence = self._room(self._draw(1), frames) if self.config.sequence else None
 
     def _draw(self, number: int) -> Draw:
         return Draw((self.seed * 1_000_003 + 500_000 + number) % 2**63)
 
-    def _stage(self, draw: Draw, frames: int) -> Stage:
+    def _room(self, draw: Draw, frames: int) -> Room:
         count = self.config.people or 1 + int(torch.bucketize(draw.uniform(0, 1, 1), torch.tensor([0.5, 0.85])))
         actors = []
         for _ in range(count):
@@ -171,7 +171,7 @@ class Studio:
         near, far = scene.distance_m
         limit = max(near, float(self.rig.max_z) - _REACH)
         scene = replace(scene, distance_m=(near, min(far, limit)))
-        return make_stage(draw, scene, self.raw_camera.color, actors)
+        return make_room(draw, scene, self.raw_camera.color, actors)
 
     def __iter__(self) -> Iterator[SyntheticFrame]:
         return (self.frame(i) for i in range(self.frames))
@@ -180,32 +180,32 @@ class Studio:
     def frame(self, index: int) -> SyntheticFrame:
         """Frame number `index`."""
         draw = self._draw(2 + index)
-        stage = self._sequence or self._stage(draw, 1)
-        moments = stage.moments(index if self._sequence else 0)
-        R, center = stage.cameras.R_cam_world[0], stage.cameras.center[0]
-        seen = look(stage, moments, self.raw_camera.color, R, center)
-        color = _photo(draw, shade(stage, seen, R, center))
-        depth = self._depth(draw, stage, moments)
+        room = self._sequence or self._room(draw, 1)
+        moments = room.moments(index if self._sequence else 0)
+        R, center = room.cameras.R_cam_world[0], room.cameras.center[0]
+        seen = look(room, moments, self.raw_camera.color, R, center)
+        color = _photo(draw, shade(room, seen, R, center))
+        depth = self._depth(draw, room, moments)
         time = index / self.config.fps if self._sequence else None
         frame = Frame(color, depth, self.raw_camera, index, time)
         if self.config.registered:
             frame = Frame(color, register(frame).depth.z, self.camera, index, time)
-        joints = stage.cameras.to_cam(torch.stack([m.joints for m in moments]))
+        joints = room.cameras.to_cam(torch.stack([m.joints for m in moments]))
         camera = self.camera.color
-        truth = [_truth(i, joints[i], m, stage, seen, camera) for i, m in enumerate(moments)]
-        keypoints = _detections(draw, self.config.detector, truth, moments, stage, camera)
+        truth = [_truth(i, joints[i], m, room, seen, camera) for i, m in enumerate(moments)]
+        keypoints = _detections(draw, self.config.detector, truth, moments, room, camera)
         return SyntheticFrame(frame, tuple(t for t in truth if t.in_view.any()), keypoints)
 
-    def _depth(self, draw: Draw, stage: Stage, moments: list[Moment]) -> Float32[np.ndarray, "h w"]:
+    def _depth(self, draw: Draw, room: Room, moments: list[Moment]) -> Float32[np.ndarray, "h w"]:
         """What the depth camera measures, metres."""
         T = self.raw_camera.T_color_depth
-        R_world = stage.cameras.R_cam_world[0]
+        R_world = room.cameras.R_cam_world[0]
         R = torch.tensor(T[:3, :3].T, dtype=torch.float32) @ R_world
-        center = stage.cameras.center[0] + R_world.T @ torch.tensor(T[:3, 3], dtype=torch.float32)
+        center = room.cameras.center[0] + R_world.T @ torch.tensor(T[:3, 3], dtype=torch.float32)
         camera = self.raw_camera.depth
-        seen = look(stage, moments, camera, R, center)
+        seen = look(room, moments, camera, R, center)
         dark = (seen.values[..., 3] > 0.5) & (seen.people < seen.boxes)
-        distance = stage.cameras.to_cam(moments[0].joints[None])[0, 1, 2]
+        distance = room.cameras.to_cam(moments[0].joints[None])[0, 1, 2]
         finer = round(_PIXEL_M * camera.fx / float(distance.clamp(0.5, 8.0)))
         measured = self.rig.degrade(draw, seen.depth[None], dark[None], max(1, finer))[0]
         return measured.numpy().astype(np.float32)
@@ -237,7 +237,7 @@ def _photo(draw: Draw, color: Float[Tensor, "h w 3"]) -> UInt8[np.ndarray, "h w 
 
 
 def _truth(
-    id: int, joints: Float[Tensor, "18 3"], moment: Moment, stage: Stage, seen: View, camera: Camera
+    id: int, joints: Float[Tensor, "18 3"], moment: Moment, room: Room, seen: View, camera: Camera
 ) -> TruthPerson:
     """One person's truth. joints: colour camera's frame."""
     p = joints.double().numpy()
@@ -246,9 +246,9 @@ def _truth(
     u, v = np.rint(np.where(in_view[:, None], uv, 0.0)).astype(int).T
     surface, person = seen.depth[v, u], seen.people[v, u]
     hidden, _ = hidden_joints(surface[None], person[None], joints[None, :, 2])
-    palms = (moment.palms @ stage.cameras.R_cam_world[0].T).double().numpy()
+    palms = (moment.palms @ room.cameras.R_cam_world[0].T).double().numpy()
     palms /= np.linalg.norm(palms, axis=1, keepdims=True)
-    hands = camera.contains(camera.project(stage.cameras.to_cam(moment.hands[None])[0].double().numpy()))
+    hands = camera.contains(camera.project(room.cameras.to_cam(moment.hands[None])[0].double().numpy()))
     return TruthPerson(
         id,
         p,
@@ -260,7 +260,7 @@ def _truth(
 
 
 def _detections(
-    draw: Draw, config: DetectorConfig, truth: list[TruthPerson], moments: list[Moment], stage: Stage, camera: Camera
+    draw: Draw, config: DetectorConfig, truth: list[TruthPerson], moments: list[Moment], room: Room, camera: Camera
 ) -> list[Keypoints2D]:
     """Whom a detector finds, in random order."""
     joints = torch.from_numpy(np.stack([t.keypoints for t in truth])).float()
@@ -274,9 +274,7 @@ def _detections(
     if len(truth) > 1:
         apart = torch.cdist(middle, middle).fill_diagonal_(torch.inf)
         other_xy = view.columns(joints[apart.argmin(1)] @ R.mT, root_z)[..., :2]
-    to_camera = torch.nn.functional.normalize(
-        stage.cameras.center - torch.stack([m.joints[1] for m in moments]), dim=-1
-    )
+    to_camera = torch.nn.functional.normalize(room.cameras.center - torch.stack([m.joints[1] for m in moments]), dim=-1)
     front = (torch.stack([m.facing for m in moments]) * to_camera).sum(-1)
     found = detect(draw, config, xy, root_z, hidden, in_view, front < FROM_BEHIND, other_xy)
     rays = torch.cat([found[..., :2] / root_z[:, None, None], torch.ones(*hidden.shape, 1)], -1) @ R

@@ -13,7 +13,7 @@ from understudy.overlay import Rgb, bone_color, describe, joint_color, person_co
 from understudy.skeleton import BONES, FACE, HAND_BONES, JOINT
 from understudy.types import INFERRED, Person
 from understudy.viewer.cloud import Cloud, near_people, thin
-from understudy.viewer.floor import find_floor
+from understudy.floor import find_floor
 from understudy.viewer.results import Moment
 
 JOINT_RADIUS_M = 0.028

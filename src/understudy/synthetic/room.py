@@ -29,7 +29,7 @@ _MARGIN: Final = 0.06
 
 
 @dataclass(frozen=True)
-class Stage:
+class Room:
     """World frame, metres; batches of one."""
 
     actors: tuple[Actor, ...]
@@ -44,7 +44,7 @@ class Stage:
         return [a.at(frame) for a in self.actors]
 
 
-def make_stage(draw: Draw, config: SceneConfig, camera: Camera, actors: list[Actor]) -> Stage:
+def make_room(draw: Draw, config: SceneConfig, camera: Camera, actors: list[Actor]) -> Room:
     """Puts people side by side, a camera before them and furniture around them."""
     placed = _arranged(draw, actors)
     joints = torch.stack([a.joints for a in placed])  # (m, f, 18, 3)
@@ -60,7 +60,7 @@ def make_stage(draw: Draw, config: SceneConfig, camera: Camera, actors: list[Act
     light = torch.nn.functional.normalize(
         torch.cat([draw.uniform(-0.8, 0.8, 1), draw.uniform(-1.0, -0.3, 1), draw.uniform(0.5, 1.2, 1)]), dim=0
     )
-    return Stage(tuple(placed), cameras, boxes, room_colors(draw, boxes.yaw.shape[1]), light)
+    return Room(tuple(placed), cameras, boxes, room_colors(draw, boxes.yaw.shape[1]), light)
 
 
 def _arranged(draw: Draw, actors: list[Actor]) -> list[Actor]:
@@ -140,7 +140,7 @@ class View:
 
 
 def look(
-    stage: Stage, moments: list[Moment], camera: Camera, R_cam_world: Float[Tensor, "3 3"], center: Float[Tensor, " 3"]
+    room: Room, moments: list[Moment], camera: Camera, R_cam_world: Float[Tensor, "3 3"], center: Float[Tensor, " 3"]
 ) -> View:
     """The room through a camera without distortion. center: of the camera, world."""
     parts = [m.surfels for m in moments]
@@ -152,18 +152,18 @@ def look(
     v = (torch.arange(camera.height) - camera.cy) / camera.fy
     v, u = torch.meshgrid(v.float(), u.float(), indexing="ij")
     rays = torch.stack([u, v, torch.ones_like(u)], -1) @ R_cam_world
-    distance, which = render.cast_which(stage.boxes, center[None], rays.reshape(1, -1, 3))
+    distance, which = render.cast_which(room.boxes, center[None], rays.reshape(1, -1, 3))
     size = people.shape
     return View(people, distance.reshape(size), mean[..., :4], mean[..., 4:], which.reshape(size), rays)
 
 
-def shade(stage: Stage, view: View, R_cam_world: Float[Tensor, "3 3"], center: Float[Tensor, " 3"]) -> Tensor:
+def shade(room: Room, view: View, R_cam_world: Float[Tensor, "3 3"], center: Float[Tensor, " 3"]) -> Tensor:
     """(h, w, 3) colours 0..1: matt surfaces in plain colours under one light."""
     normal = torch.nn.functional.normalize(view.normals, dim=-1) @ R_cam_world
     color = view.values[..., :3]
     box = view.boxes < view.people
     k = view.which[box]
-    boxes = stage.boxes
+    boxes = room.boxes
     offset = center + view.rays[box] * view.boxes[box, None] - boxes.center[0, k]
     c, s = boxes.yaw[0, k].cos(), boxes.yaw[0, k].sin()
     local = torch.stack([c * offset[:, 0] + s * offset[:, 1], c * offset[:, 1] - s * offset[:, 0], offset[:, 2]], 1)
@@ -171,7 +171,7 @@ def shade(stage: Stage, view: View, R_cam_world: Float[Tensor, "3 3"], center: F
     flat = torch.zeros_like(local).scatter_(1, face, local.gather(1, face).sign())
     n_box = torch.stack([c * flat[:, 0] - s * flat[:, 1], s * flat[:, 0] + c * flat[:, 1], flat[:, 2]], 1)
     normal[box], color = n_box, color.clone()
-    color[box] = stage.box_colors[k]
-    bright = 0.5 + 0.5 * (normal @ stage.light).clamp_min(0)
+    color[box] = room.box_colors[k]
+    bright = 0.5 + 0.5 * (normal @ room.light).clamp_min(0)
     nothing = view.depth >= render.FAR
     return torch.where(nothing[..., None], 0.6, color * bright[..., None])

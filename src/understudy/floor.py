@@ -1,4 +1,4 @@
-"""Where up is and where the floor is, so that the scene stands upright although the camera may look down."""
+"""Where up is and where the floor is: the world that stands upright although the camera may look down."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Float32
 
+from understudy.geometry import rigid
 from understudy.types import Person
 
 CAMERA_UP = np.array([0.0, -1.0, 0.0])
@@ -30,6 +31,8 @@ class Floor:
     """unit vector"""
     height: float
     """metres; negative when the floor is under the camera"""
+    seen: bool = True
+    """False: nothing that was measured looked like a floor, and it was put below the people"""
 
     def below(self, point: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
         """The floor's point under (or over) a point."""
@@ -49,7 +52,7 @@ def find_floor(points: Float32[np.ndarray, "n 3"] | None, people: Sequence[Perso
 def _under(people: Sequence[Person]) -> Floor:
     joints = np.concatenate([p.keypoints for p in people]) if people else np.zeros((0, 3))
     lowest = joints[np.isfinite(joints).all(axis=1), 1]
-    return Floor(CAMERA_UP, -(float(lowest.max()) + 0.08) if len(lowest) else -1.5)
+    return Floor(CAMERA_UP, -(float(lowest.max()) + 0.08) if len(lowest) else -1.5, seen=False)
 
 
 def _fit(points: Float[np.ndarray, "n 3"]) -> Floor | None:
@@ -74,3 +77,16 @@ def _fit(points: Float[np.ndarray, "n 3"]) -> Floor | None:
     up = np.linalg.svd(best - centre, full_matrices=False)[2][2]
     up *= np.sign(up @ CAMERA_UP) or 1.0
     return Floor(up, float(up @ centre))
+
+
+def world_from_camera(floor: Floor) -> Float[np.ndarray, "4 4"]:
+    """T_world_cam of the world that CONVENTIONS.md describes: z up, the floor at z = 0, the origin below the camera,
+    x the way that the camera looks (one that looks straight down: the way of its image's upper edge).
+    """
+    z = floor.up
+    forward = np.array([0.0, 0.0, 1.0]) - z * z[2]
+    if np.linalg.norm(forward) < 1e-3:
+        forward = CAMERA_UP - z * (CAMERA_UP @ z)
+    x = forward / np.linalg.norm(forward)
+    R = np.stack([x, np.cross(z, x), z])
+    return rigid(R, np.array([0.0, 0.0, -floor.height]))

@@ -1,0 +1,161 @@
+"""The static scene (what stays where it is while person and moving part do not), and its map for a robot's base."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, UInt8
+from scipy.spatial import cKDTree
+
+from understudy.demonstration.demonstration import FREE, OCCUPIED, UNKNOWN, OccupancyMap
+from understudy.geometry import inverse, transform_points
+from understudy.skeleton import BONES
+from understudy.types import RegisteredDepth
+from understudy.voxels import cloud
+
+VOXEL: Final = 0.04
+"""metres"""
+RESOLUTION: Final = 0.05
+"""metres: edge of a cell of the map"""
+HEIGHTS: Final = (0.10, 1.60)
+"""metres above the floor: what a base (and what stands on it) can bump into"""
+
+_POINTS = 40_000  # of a frame
+_BODY = 0.25  # metres around the bones that belong to the person (clothes, and the error of joints)
+_BEHIND = 0.10  # metres: measured so much farther away means that nothing was there
+_FARTHEST = 6.0  # metres from the camera: beyond, depth is not worth a map
+_STAYS = 0.6  # least share of the looks at a place that found something
+_PART = 0.06  # metres around the moving part
+_RAYS, _LOW = 3000, 0.5  # rays of a frame that clear the way; below this height, metres
+_WALKED = 0.20  # metres around where the person walked
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """What the camera measured at one moment, and the people it saw."""
+
+    depth: RegisteredDepth
+    joints: Float[np.ndarray, "k 18 3"]
+    """of k people, colour camera's frame, metres; NaN rows are allowed"""
+
+
+def static_scene(
+    views: Sequence[View], T_world_cam: Float[np.ndarray, "4 4"], part: Sequence[Float[np.ndarray, "_ 3"]] = ()
+) -> Float32[np.ndarray, "n 3"]:
+    """Points (world, one for each voxel) of what stayed in its place.
+
+    A place counts when most looks at it found a surface: looks in which something nearer hid it say nothing; looks that
+    went through it speak against it. part: points of the moving part in some of its poses (world); they are left out.
+    """
+    T_cam_world = inverse(T_world_cam)
+    clouds = [transform_points(T_world_cam, _without_people(view).astype(np.float64)) for view in views]
+    keys = [np.unique(np.floor(c / VOXEL).astype(np.int32), axis=0) for c in clouds]
+    if not keys or not sum(map(len, keys)):
+        return np.zeros((0, 3), np.float32)
+    voxel, which, hits = np.unique(np.concatenate(keys), axis=0, return_inverse=True, return_counts=True)
+    which = which.ravel()
+    center = (voxel + 0.5) * VOXEL
+    in_camera = transform_points(T_cam_world, center)
+    through = sum(_seen_through(view.depth, in_camera) for view in views)
+    keep = hits >= _STAYS * (hits + through)
+    if len(views) > 2:
+        keep &= hits > 1
+    points = center[keep]
+    for pose in part:
+        if len(pose) and len(points):
+            points = points[cKDTree(pose).query(points, distance_upper_bound=_PART)[0] > _PART]
+    return points.astype(np.float32)
+
+
+def occupancy(
+    scene: Float32[np.ndarray, "n 3"],
+    views: Sequence[View],
+    T_world_cam: Float[np.ndarray, "4 4"],
+    walked: Float[np.ndarray, "_ 2"] | None = None,
+) -> OccupancyMap:
+    """The map of a scene: occupied where it has points at HEIGHTS; free where the floor was seen, where low rays
+    passed, and around where the person walked (world, metres); unknown elsewhere.
+    """
+    solid = scene[(scene[:, 2] > HEIGHTS[0]) & (scene[:, 2] < HEIGHTS[1])]
+    open_floor = scene[np.abs(scene[:, 2]) < HEIGHTS[0]]
+    rays = [_low_points(view, T_world_cam) for view in views]
+    ways = np.zeros((0, 2)) if walked is None else walked[np.isfinite(walked).all(axis=1)]
+    everything = np.concatenate([scene[:, :2], *(r[:, :2] for r in rays), ways])
+    if not len(everything):
+        return OccupancyMap(np.zeros((1, 1), np.uint8), np.zeros(2), RESOLUTION)
+    low = np.floor(everything.min(axis=0) / RESOLUTION) - 2
+    size = np.ceil(everything.max(axis=0) / RESOLUTION) + 3 - low
+    state = np.full((int(size[1]), int(size[0])), UNKNOWN, np.uint8)
+    for points in (open_floor, *rays):
+        _mark(state, points[:, :2], low, FREE)
+    disc = _disc(_WALKED)
+    _mark(state, (ways[:, None] + disc).reshape(-1, 2), low, FREE)
+    _mark(state, solid[:, :2], low, OCCUPIED)
+    return OccupancyMap(state, low * RESOLUTION, RESOLUTION)
+
+
+def _without_people(view: View) -> Float32[np.ndarray, "n 3"]:
+    """Points of the depth image that do not lie on or near a person; colour camera's frame."""
+    points = cloud(view.depth, _POINTS)
+    points = points[points[:, 2] < _FARTHEST]
+    ends = view.joints[:, np.array(BONES)].reshape(-1, 2, 3)
+    ends = ends[np.isfinite(ends).all(axis=(1, 2))].astype(np.float32)
+    if not len(ends):
+        return points
+    near = np.flatnonzero(
+        ((points > ends.min(axis=(0, 1)) - _BODY) & (points < ends.max(axis=(0, 1)) + _BODY)).all(axis=1)
+    )
+    keep = np.ones(len(points), bool)
+    keep[near] = _distance_to_bones(points[near], ends) > _BODY
+    return points[keep]
+
+
+def _distance_to_bones(points: Float32[np.ndarray, "n 3"], ends: Float32[np.ndarray, "k 2 3"]) -> np.ndarray:
+    """Metres from each point to the nearest of k straight bones."""
+    best = np.full(len(points), np.inf, np.float32)
+    for a, b in ends:
+        along = b - a
+        share = np.clip((points - a) @ along / max(float(along @ along), 1e-9), 0, 1)
+        best = np.minimum(best, np.linalg.norm(points - a - share[:, None] * along, axis=1))
+    return best
+
+
+def _seen_through(depth: RegisteredDepth, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+    """Which points (camera's frame) lie clearly in front of what was measured in their pixel."""
+    z = points[:, 2]
+    uv = depth.camera.project(points)
+    inside = depth.camera.contains(uv) & (z > 0.1)
+    column, row = np.rint(uv[inside]).astype(int).T
+    measured = depth.z[row, column]
+    out = np.zeros(len(points), bool)
+    out[inside] = measured > z[inside] + _BEHIND
+    return out
+
+
+def _low_points(view: View, T_world_cam: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "n 3"]:
+    """Places in the air that rays passed at a height of less than _LOW; world."""
+    points = _without_people(view)
+    points = points[:: max(1, len(points) // _RAYS)].astype(np.float64)
+    end, start = transform_points(T_world_cam, points), T_world_cam[:3, 3]
+    steps = max(2, int(np.ceil(_FARTHEST / RESOLUTION)))
+    share = (np.arange(steps) + 0.5) / steps * 0.98  # not into what the ray met
+    drop = start[2] - end[:, 2]
+    from_share = np.where(drop > 1e-6, (start[2] - _LOW) / np.maximum(drop, 1e-6), 2.0)  # where the ray gets so low
+    ray, step = np.nonzero(share > np.maximum(from_share, 0)[:, None])
+    passed: np.ndarray = start + share[step, None] * (end[ray] - start)
+    return passed[passed[:, 2] > 0.02]
+
+
+def _disc(radius: float) -> Float[np.ndarray, "n 2"]:
+    n = int(np.ceil(radius / RESOLUTION))
+    grid = np.stack(np.meshgrid(*[np.arange(-n, n + 1) * RESOLUTION] * 2), axis=-1).reshape(-1, 2)
+    return grid[np.linalg.norm(grid, axis=1) <= radius]
+
+
+def _mark(state: UInt8[np.ndarray, "r c"], xy: Float[np.ndarray, "n 2"], low: np.ndarray, value: int) -> None:
+    cell = np.rint(xy / RESOLUTION - low).astype(int)
+    inside = ((cell >= 0) & (cell < (state.shape[1], state.shape[0]))).all(axis=1)
+    state[cell[inside, 1], cell[inside, 0]] = value
