@@ -8,7 +8,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 export TF_CPP_MIN_LOG_LEVEL := 2
 
 # these write pages of docs/, from recordings that not everybody has
-PAGES := benchmarks/paper_tables.py benchmarks/palms.py
+PAGES := benchmarks/paper_tables.py benchmarks/palms.py benchmarks/demonstrations.py
 .PHONY: demo test check format bench clean help
 
 help:

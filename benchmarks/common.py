@@ -32,7 +32,6 @@ def report(name: str, heads: list[str], rows: list[list[str]], notes: str = "") 
     """Prints a table, and keeps it in results/NAME.md with the command, versions and hardware."""
     lines = ["| " + " | ".join(heads) + " |", "|" + "---|" * len(heads)]
     lines += ["| " + " | ".join(row) + " |" for row in rows]
-    packages = ", ".join(f"{p} {version(p)}" for p in ("numpy", "scipy", "opencv-python-headless", "openvino"))
     text = "\n".join(
         [
             f"# {name}",
@@ -40,16 +39,26 @@ def report(name: str, heads: list[str], rows: list[list[str]], notes: str = "") 
             *lines,
             "",
             *([notes, ""] if notes else []),
-            f"- command: `python {' '.join([str(Path(sys.argv[0])), *sys.argv[1:]])}`",
-            f"- {time.strftime('%Y-%m-%d')}, understudy {understudy.__version__}, Python {platform.python_version()}, "
-            f"{packages}",
-            f"- {_cpu()}",
+            machine(),
             "",
         ]
     )
     print(text)
     RESULTS.mkdir(exist_ok=True)
     (RESULTS / f"{name}.md").write_text(text)
+
+
+def machine() -> str:
+    """Lines on what a result depends on: command, versions, hardware."""
+    packages = ", ".join(f"{p} {version(p)}" for p in ("numpy", "scipy", "opencv-python-headless", "openvino"))
+    return "\n".join(
+        [
+            f"- command: `python {' '.join([str(Path(sys.argv[0])), *sys.argv[1:]])}`",
+            f"- {time.strftime('%Y-%m-%d')}, understudy {understudy.__version__}, Python {platform.python_version()}, "
+            f"{packages}",
+            f"- {_cpu()}",
+        ]
+    )
 
 
 def _cpu() -> str:

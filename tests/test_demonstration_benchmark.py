@@ -19,7 +19,7 @@ from understudy.trajectories import PlanarTrack, PoseTrack
 def truth_of(demo: Demonstration) -> TrueDemonstration:
     T_cam_world = inverse(demo.T_world_cam)
     T_world_torso = np.tile(np.eye(4), (len(demo), 1, 1))
-    T_world_torso[:, :3, :3] = Rotation.from_euler("z", demo.torso.xy_yaw[:, 2]).as_matrix()
+    T_world_torso[:, :3, :3] = Rotation.from_rotvec(demo.torso.xy_yaw[:, 2:] * [0, 0, 1]).as_matrix()
     T_world_torso[:, :2, 3] = demo.torso.xy_yaw[:, :2]
     return TrueDemonstration(
         demo.task,

@@ -221,7 +221,7 @@ class _Run:
 
     def _numbered(self, frame: FramePeople) -> FramePeople:
         """With ids that stay with people, in their order."""
-        people = self._tracker.update(frame.people)
+        people = self._tracker.update(frame.people, frame.timestamp_s)
         return replace(frame, people=tuple(sorted(people, key=lambda person: person.id)))
 
     def _picture(self, index: int) -> Path:

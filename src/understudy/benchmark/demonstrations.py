@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -20,6 +21,7 @@ from understudy.demonstration.segments import MOVING
 from understudy.errors import UnderstudyError
 from understudy.geometry import angle_between, inverse
 from understudy.objects.articulation import PRISMATIC, REVOLUTE, Articulation
+from understudy.skeleton import JOINT
 from understudy.trajectories import PoseTrack
 
 BOUNDARY_S: Final = 0.3
@@ -84,6 +86,34 @@ class DemonstrationErrors:
     """error of the range, as a share of the true one"""
     nees: float
     """mean squared error of the hand's position in units of its variance: 3 when the covariances are right"""
+
+
+def from_stage(folder: str | Path) -> TrueDemonstration:
+    """The truth of a recording from the stage. Raises RecordingError when it has none."""
+    from understudy import recordings
+    from understudy.stage.truth import read_stage_truth
+
+    stage = read_stage_truth(folder)
+    with recordings.open(folder) as recording:
+        people = recording.truth
+        row = JOINT[f"{stage.acting}_wrist"]
+        shown = people.frames if people is not None else {}
+        visible = [any(p.in_view[row] and not p.occluded[row] for p in shown.get(i, ())) for i in recording.indices]
+    T_cam_world = inverse(stage.T_world_cam)
+    T_world_torso = np.tile(np.eye(4), (len(stage.times_s), 1, 1))
+    T_world_torso[:, :3, :3] = Rotation.from_rotvec(stage.torso_xy_yaw[:, 2:] * [0, 0, 1]).as_matrix()
+    T_world_torso[:, :2, 3] = stage.torso_xy_yaw[:, :2]
+    return TrueDemonstration(
+        stage.task,
+        stage.times_s,
+        stage.acting,
+        T_cam_world @ stage.T_world_hand[stage.acting],
+        np.array(visible),
+        T_cam_world @ T_world_torso,
+        T_cam_world @ stage.T_world_object,
+        stage.furniture.articulation.moved(T_cam_world),
+        stage.q,
+    )
 
 
 def score(demo: Demonstration, truth: TrueDemonstration) -> DemonstrationErrors:

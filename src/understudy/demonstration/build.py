@@ -26,7 +26,7 @@ from understudy.objects.moving_part import HandHint, MovingPart, find_moving_par
 from understudy.people_file import FramePeople
 from understudy.recordings.base import Recording
 from understudy.registration import register
-from understudy.tracking import PersonTrack, smooth
+from understudy.tracking import PersonTrack, frame_times, smooth
 from understudy.trajectories import PoseTrack
 from understudy.types import Palm, Person, RegisteredFrame
 from understudy.voxels import cloud
@@ -76,7 +76,7 @@ def build(
     Raises UnderstudyError where the recording shows no demonstration: nobody, nothing that moves, no clock.
     """
     config = config or DemonstrationConfig()
-    times = _times(recording, people, config.fps)
+    times = frame_times(people, config.fps or recording.fps)
     frames = Frames(recording, [f.index for f in people if f.skipped is None])
     floor = _floor(frames, people)
     T_world_cam = world_from_camera(floor)
@@ -140,16 +140,6 @@ class Frames(Sequence[RegisteredFrame]):
         """Positions of these frames in the list of all."""
         where = {f.index: i for i, f in enumerate(people)}
         return np.array([where[i] for i in self.indices], dtype=int)
-
-
-def _times(recording: Recording, people: Sequence[FramePeople], fps: float | None) -> Float[np.ndarray, " n"]:
-    known = [f.timestamp_s for f in people]
-    if all(t is not None for t in known):
-        return np.array(known, np.float64)
-    fps = fps or recording.fps
-    if not fps:
-        raise UnderstudyError(f"{recording.path}: has no timestamps; say how many frames a second it has (--fps)")
-    return np.array([f.index for f in people]) / fps
 
 
 def _floor(frames: Frames, people: Sequence[FramePeople]) -> Floor:
