@@ -100,11 +100,11 @@ def test_interrupting_a_repeated_run_loses_nothing(recording, tmp_path, monkeypa
     before = (tmp_path / "out" / "people.json").read_text()
     update, calls = IdentityTracker.update, []
 
-    def interrupted(self, people):
+    def interrupted(self, people, time_s=None):
         calls.append(people)
         if len(calls) == 2:
             raise KeyboardInterrupt
-        return update(self, people)
+        return update(self, people, time_s)
 
     monkeypatch.setattr(IdentityTracker, "update", interrupted)
     with pytest.raises(KeyboardInterrupt):
