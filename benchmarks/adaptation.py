@@ -2,8 +2,8 @@
 
     python benchmarks/adaptation.py [--robot pr2] [--gtsam-demonstrations 2] [--longest 20000]
 
-gtsam gets its own factors (C++) for all edges between poses, and Python callbacks for map and reachability, which it has
-no factors for. Both solve the same least-squares problem, from the same start, to the same tolerance.
+gtsam gets its own factors (C++) for all edges between poses, and Python callbacks for map and reachability, which it
+has no factors for. Both solve the same least-squares problem, from the same start, to the same tolerance.
 """
 
 from __future__ import annotations

@@ -55,6 +55,18 @@ def torso_track(track: PersonTrack, T_world_cam: Float[np.ndarray, "4 4"]) -> Pl
     return PlanarTrack(xy_yaw, covariance, observed & known)
 
 
+def on_the_floor(torso: PoseTrack) -> PlanarTrack:
+    """The planar track of a torso that is followed in space (x the way that the chest faces)."""
+    R = torso.T_world_x[:, :3, :3]
+    yaw = np.arctan2(R[:, 1, 0], R[:, 0, 0])
+    known = torso.known
+    yaw[known] = np.unwrap(yaw[known])
+    rows_ = [0, 1, 5]
+    return PlanarTrack(
+        np.column_stack([torso.positions[:, :2], yaw]), torso.covariance[:, rows_][:, :, rows_], torso.observed
+    )
+
+
 def hand_track(
     track: PersonTrack, palms: Sequence[Palm | None], side: str, T_world_cam: Float[np.ndarray, "4 4"]
 ) -> PoseTrack:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, overload
+from typing import Any, overload
 
 import numpy as np
 from jaxtyping import Float
@@ -14,15 +14,17 @@ from jaxtyping import Float
 import understudy
 from understudy.demonstration import clock
 from understudy.demonstration.actor import Candidate, reaching_hands
-from understudy.demonstration.body_tracks import hand_track, hold, torso_track
+from understudy.demonstration.body_tracks import hand_track, hold, on_the_floor, torso_track
 from understudy.demonstration.demonstration import Demonstration
+from understudy.demonstration.object_track import ObjectTrack, by_depth, by_markers
 from understudy.demonstration.scene_map import View, occupancy, static_scene
 from understudy.demonstration.segments import find_segments
 from understudy.errors import UnderstudyError, one_of
 from understudy.floor import Floor, find_floor, world_from_camera
 from understudy.geometry import transform_points
 from understudy.objects.articulation import FIXED, REVOLUTE, Articulation
-from understudy.objects.moving_part import HandHint, MovingPart, find_moving_part
+from understudy.objects.marker_setup import MarkerSetup, track_markers
+from understudy.objects.moving_part.finder import HandHint
 from understudy.people_file import FramePeople
 from understudy.recordings.base import Recording
 from understudy.registration import register
@@ -31,7 +33,7 @@ from understudy.trajectories import PoseTrack
 from understudy.types import Palm, Person, RegisteredFrame
 from understudy.voxels import cloud
 
-SOURCES: Final = ("rgbd", "markers")
+RGBD, MARKERS = SOURCES = ("rgbd", "markers")
 """Where poses come from: `rgbd`: from depth and colour alone; `markers`: from fiducial markers."""
 
 _VIEWS = 14  # frames that the static scene is made of
@@ -81,34 +83,62 @@ def build(
     floor = _floor(frames, people)
     T_world_cam = world_from_camera(floor)
     tracks = smooth(times, [f.people for f in people])
-    even = clock.even_times(times, config.rate_hz)
-    part, actor = _object(frames, people, times, tracks, T_world_cam, config)
-    on_clock = clock.resample_poses(part.track, times[frames.rows(people)], even)
-    way = _way(part.articulation, on_clock)
-    hand = clock.resample_poses(_hand(actor, people, times, T_world_cam), actor.track.times_s, even)
-    apart = np.where(hand.observed, np.linalg.norm(hand.positions - on_clock.positions, axis=1), np.nan)
-    segments = find_segments(even, way, apart)
-    hand = hold(hand, on_clock, even, segments.slices(len(even))["manipulate"])
-    torso = clock.resample_planar(torso_track(actor.track, T_world_cam), actor.track.times_s, even)
+    carried = track_markers(frames, MarkerSetup.read(Path(config.markers)), T_world_cam) if config.markers else {}
+    body = _Body(people, times, tracks, T_world_cam, carried)
+    thing, actor = _object(frames, people, body, config)
+    even, frame_times_s = clock.even_times(times, config.rate_hz), times[frames.rows(people)]
+    object = clock.resample_poses(thing.track, frame_times_s, even)
+    if config.teacher == MARKERS:
+        hand = clock.resample_poses(_carried(body, "hand"), frame_times_s, even)
+        torso = clock.resample_planar(on_the_floor(_carried(body, "torso")), frame_times_s, even)
+    else:
+        hand = clock.resample_poses(body.hand(actor), actor.track.times_s, even)
+        torso = clock.resample_planar(torso_track(actor.track, T_world_cam), actor.track.times_s, even)
+    apart = np.where(hand.observed, np.linalg.norm(hand.positions - object.positions, axis=1), np.nan)
+    segments = find_segments(even, _way(thing.articulation, object), apart)
+    if config.teacher == RGBD:
+        hand = hold(hand, object, even, segments.slices(len(even))["manipulate"])
     views = _views(frames, people)
-    scene = static_scene(views, T_world_cam, _swept(part))
+    scene = static_scene(views, T_world_cam, _swept(thing))
     return Demonstration(
         task=config.task,
         times_s=even,
         acting=actor.side,
         hand=hand,
         torso=torso,
-        object=on_clock,
-        articulation=part.articulation,
-        handle=part.handle,
+        object=object,
+        articulation=thing.articulation,
+        handle=thing.handle,
         segments=segments,
         map=occupancy(scene, views, T_world_cam, torso.xy_yaw[torso.observed, :2]),
         scene=scene,
         T_world_cam=T_world_cam,
         joints=clock.resample_points(transform_points(T_world_cam, actor.track.keypoints), actor.track.times_s, even),
-        part=part.part_points.astype(np.float32),
+        part=thing.part.astype(np.float32),
         source=_source(recording, people, floor, actor, config),
     )
+
+
+@dataclass(frozen=True, eq=False)
+class _Body:
+    """What is known of people and markers before the object is."""
+
+    people: Sequence[FramePeople]
+    times: Float[np.ndarray, " n"]
+    """of the frames, seconds; those that could not be read, too"""
+    tracks: Sequence[PersonTrack]
+    T_world_cam: Float[np.ndarray, "4 4"]
+    carried: Mapping[str, PoseTrack]
+    """by what they are on, at the times of the frames that could be read"""
+
+    def hand(self, actor: Candidate) -> PoseTrack:
+        """A hand at the times of its person's track, as the skeleton and the palms tell."""
+        palms: dict[float, Palm | None] = {}
+        for time, frame in zip(self.times.tolist(), self.people, strict=True):
+            person = next((p for p in frame.people if p.id == actor.track.id and p.failed is None), None)
+            palms[time] = None if person is None else person.hands.get(actor.side)
+        own = [palms.get(time) for time in actor.track.times_s.tolist()]
+        return hand_track(actor.track, own, actor.side, self.T_world_cam)
 
 
 class Frames(Sequence[RegisteredFrame]):
@@ -152,44 +182,42 @@ def _floor(frames: Frames, people: Sequence[FramePeople]) -> Floor:
 
 
 def _object(
-    frames: Frames,
-    people: Sequence[FramePeople],
-    times: Float[np.ndarray, " n"],
-    tracks: Sequence[PersonTrack],
-    T_world_cam: Float[np.ndarray, "4 4"],
-    config: DemonstrationConfig,
-) -> tuple[MovingPart, Candidate]:
-    """The moving part, and whose hand moves it: of the hands that reach, the one with which a part is found best."""
-    hands = reaching_hands(tracks, T_world_cam)
-    hands = [h for h in hands if h.reaching_s >= _ALIKE * hands[0].reaching_s][:2]
-    rows = frames.rows(people)
-    seen = [people[i].people for i in rows]
-    found: list[tuple[MovingPart, Candidate]] = []
-    complaint: UnderstudyError | None = None
-    for hand in hands:
-        track = clock.resample_poses(_hand(hand, people, times, T_world_cam), hand.track.times_s, times[rows])
+    frames: Frames, people: Sequence[FramePeople], body: _Body, config: DemonstrationConfig
+) -> tuple[ObjectTrack, Candidate]:
+    """The object, and whose hand moves it."""
+    hands = reaching_hands(body.tracks, body.T_world_cam)
+    try:
+        if config.object == MARKERS:
+            return by_markers(_carried(body, "object")), hands[0]
+        return _found(frames, [people[i].people for i in frames.rows(people)], body, hands)
+    except UnderstudyError as e:
+        raise UnderstudyError(f"{frames.recording.path}: {e}") from e
+
+
+def _found(
+    frames: Frames, seen: Sequence[Sequence[Person]], body: _Body, hands: Sequence[Candidate]
+) -> tuple[ObjectTrack, Candidate]:
+    """Of the hands that reach, the one with which an object is found best."""
+    times = body.times[frames.rows(body.people)]
+    found: list[tuple[ObjectTrack, Candidate]] = []
+    complaints: list[UnderstudyError] = []
+    for hand in [h for h in hands if h.reaching_s >= _ALIKE * hands[0].reaching_s][:2]:
+        track = clock.resample_poses(body.hand(hand), hand.track.times_s, times)
         sigma = np.sqrt(np.trace(track.covariance[:, :3, :3], axis1=1, axis2=2))
-        hint = HandHint(times[rows], track.positions, sigma)
         try:
-            found.append((find_moving_part(frames, seen, T_world_cam, hint), hand))
+            found.append((by_depth(frames, seen, body.T_world_cam, HandHint(times, track.positions, sigma)), hand))
         except UnderstudyError as e:
-            complaint = complaint or e
+            complaints.append(e)
     if not found:
-        assert complaint is not None
-        raise UnderstudyError(f"{frames.recording.path}: {complaint}") from complaint
-    return max(found, key=lambda pair: pair[0].quality)
+        raise complaints[0]
+    return max(found, key=lambda pair: pair[0].evidence)
 
 
-def _hand(
-    actor: Candidate, people: Sequence[FramePeople], times: Float[np.ndarray, " n"], T_world_cam: np.ndarray
-) -> PoseTrack:
-    """The hand at the times of its person's track."""
-    own: dict[float, Palm | None] = {}
-    for time, frame in zip(times.tolist(), people, strict=True):
-        person = next((p for p in frame.people if p.id == actor.track.id), None)
-        own[time] = None if person is None or person.failed is not None else person.hands.get(actor.side)
-    palms = [own.get(time) for time in actor.track.times_s.tolist()]
-    return hand_track(actor.track, palms, actor.side, T_world_cam)
+def _carried(body: _Body, on: str) -> PoseTrack:
+    """The track of what carries a marker, at the frames' times."""
+    if on not in body.carried:
+        raise UnderstudyError(f"there is no marker on the {on} in the file of markers")
+    return body.carried[on]
 
 
 def _way(articulation: Articulation, object: PoseTrack) -> Float[np.ndarray, " t"]:
@@ -212,11 +240,11 @@ def _joints(people: Sequence[Person]) -> Float[np.ndarray, "k 18 3"]:
     return np.array([p.keypoints for p in people]).reshape(-1, 18, 3)
 
 
-def _swept(part: MovingPart) -> list[np.ndarray]:
+def _swept(thing: ObjectTrack) -> list[np.ndarray]:
     """The moving part in poses from closed to open, world."""
-    low, high = part.articulation.range
-    poses = part.articulation.pose(np.linspace(low, high, 8))
-    return [transform_points(T, part.part_points.astype(np.float64)) for T in poses]
+    low, high = thing.articulation.range
+    poses = thing.articulation.pose(np.linspace(low, high, 8))
+    return [transform_points(T, thing.part.astype(np.float64)) for T in poses]
 
 
 def _source(
