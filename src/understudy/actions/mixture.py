@@ -187,7 +187,7 @@ def _em(x: np.ndarray, order: np.ndarray, cuts: np.ndarray) -> Any:
         from sklearn.exceptions import ConvergenceWarning
         from sklearn.mixture import GaussianMixture
     except ImportError as e:
-        raise MissingExtraError("learning an action model", "learn") from e
+        raise MissingExtraError("learning an action model", "robot") from e
     n = x.shape[1]
     parts = [part for part in np.split(order, np.round(cuts).astype(int)) if len(part)]
     covariances = [np.cov(x[part].T, bias=True).reshape(n, n) + np.eye(n) for part in parts]
