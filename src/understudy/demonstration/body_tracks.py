@@ -14,7 +14,7 @@ from understudy.hands.smoothing import smooth_rotations
 from understudy.skeleton import HAND_KEYPOINTS, JOINT, rows
 from understudy.tracking import PersonTrack
 from understudy.trajectories import PlanarTrack, PoseTrack
-from understudy.types import Palm
+from understudy.types import OBSERVED, Palm
 
 PALM_M: Final = 0.085
 """from the wrist to the middle of the palm, of a forearm of MEAN_FOREARM"""
@@ -49,10 +49,16 @@ def torso_track(track: PersonTrack, T_world_cam: Float[np.ndarray, "4 4"]) -> Pl
     covariance[:, 0, 0] = covariance[:, 1, 1] = v.mean(axis=(1, 2))
     width = np.maximum(np.linalg.norm(line, axis=1), 0.1)
     covariance[:, 2, 2] = (share**2 * v.sum(axis=1)).sum(axis=1) / width**2
-    observed = np.stack([track.observed[:, _SIDES[side]] for side in ("left", "right")], axis=1).sum(axis=(1, 2)) >= 2
+    observed = np.stack([measured_joints(track)[:, _SIDES[side]] for side in ("left", "right")], axis=1)
     xy_yaw = np.column_stack([middle[:, :2], yaw])
     xy_yaw[~known] = np.nan
-    return PlanarTrack(xy_yaw, covariance, observed & known)
+    return PlanarTrack(xy_yaw, covariance, (observed.sum(axis=(1, 2)) >= 2) & known)
+
+
+def measured_joints(track: PersonTrack) -> Bool[np.ndarray, "t 18"]:
+    """Which joints the camera saw: those that the network inferred behind something are not measurements."""
+    seen: Bool[np.ndarray, "t 18"] = track.observed & (track.source == OBSERVED)
+    return seen
 
 
 def on_the_floor(torso: PoseTrack) -> PlanarTrack:
@@ -100,7 +106,7 @@ def hand_track(
     T[ok] = np.eye(4)
     T[ok, :3, :3], T[ok, :3, 3] = rotation[ok], position[ok]
     T[ok] = T_world_cam @ T[ok]
-    observed = track.observed[:, JOINT[f"{side}_wrist"]] & ok
+    observed = measured_joints(track)[:, JOINT[f"{side}_wrist"]] & ok
     return PoseTrack(T, _isotropic(sigma, turn, ok), observed, oriented & ok)
 
 

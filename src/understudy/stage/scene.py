@@ -1,0 +1,129 @@
+"""The whole scene of one demonstration: furniture, room, person and markers, as one model of MuJoCo."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Final, Protocol, runtime_checkable
+
+import mujoco
+import numpy as np
+from jaxtyping import Float, Float32, Int, UInt8
+from scipy.spatial.transform import Rotation
+
+from understudy.demonstration.demonstration import TASKS
+from understudy.geometry import inverse
+from understudy.stage.furniture import Furniture
+from understudy.stage.markers import OBJECT, PLATE, Marker, plate_image
+from understudy.stage.mechanism import PART, add_furniture
+from understudy.stage.room import Palette, add_plate, add_room, furniture_materials
+
+_LARGEST: Final = (1280, 720)
+"""of the pictures that are rendered, pixels"""
+
+
+@runtime_checkable
+class Piece(Protocol):
+    """A part of a person's surface of one material: skin, hair, a shirt."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def faces(self) -> Int[np.ndarray, "f 3"]: ...
+    @property
+    def color(self) -> Sequence[float] | np.ndarray: ...
+    @property
+    def texture(self) -> UInt8[np.ndarray, "h w 3"] | None: ...
+    @property
+    def uv(self) -> Float[np.ndarray, "v 2"] | None: ...
+
+
+class Scene:
+    """A compiled scene. `pose` sets what moves."""
+
+    def __init__(
+        self,
+        furniture: Furniture,
+        seed: int,
+        pieces: Sequence[Piece] = (),
+        vertices: Sequence[Float32[np.ndarray, "v 3"]] = (),
+        markers: Sequence[Marker] = (),
+    ):
+        """vertices: of the pieces, at any moment. The room and all colours follow from the seed."""
+        self.furniture, self.pieces, self.markers = furniture, tuple(pieces), tuple(markers)
+        spec = mujoco.MjSpec()
+        spec.compiler.degree = False
+        spec.visual.global_.offwidth, spec.visual.global_.offheight = _LARGEST
+        spec.visual.quality.shadowsize = 2048
+        palette = Palette(spec, np.random.default_rng([seed, 71, TASKS.index(furniture.task)]))
+        materials = furniture_materials(palette)
+        add_furniture(spec, furniture, materials=materials)
+        add_room(palette, furniture, materials)
+        for piece, points in zip(self.pieces, vertices, strict=True):
+            _add_skin(palette, piece, points)
+        for marker in markers:
+            _add_marker(palette, marker)
+        # the region of shadows: beyond its rim a shadow map gives a moire pattern
+        spec.stat.extent, spec.stat.center, spec.visual.map.shadowclip = 3.0, [-0.8, 0, 1.0], 2.0
+        self.model = spec.compile()
+        palette.write(self.model)
+        self.data = mujoco.MjData(self.model)
+        self._joint = self.model.joint(PART).qposadr[0]
+        self.pose(0.0)
+
+    def pose(
+        self,
+        q: float,
+        vertices: Sequence[Float32[np.ndarray, "v 3"]] = (),
+        carried: Mapping[str, Float[np.ndarray, "4 4"]] | None = None,
+    ) -> None:
+        """Moves the part to q, the person's surface to vertices (world, one array per piece), and the markers.
+
+        carried: carrier -> T_world_marker of the marker that it carries.
+        """
+        model, data = self.model, self.data
+        data.qpos[self._joint] = q
+        for i, points in enumerate(vertices):
+            start, count = model.skin_vertadr[i], model.skin_vertnum[i]
+            if points.shape != (count, 3):
+                raise ValueError(f"piece {i}: {points.shape} vertices, the scene was made with {count}")
+            model.skin_vert[start : start + count] = points
+        for name, T in (carried or {}).items():
+            place = model.body(name).mocapid[0]
+            data.mocap_pos[place] = T[:3, 3]
+            data.mocap_quat[place] = Rotation.from_matrix(T[:3, :3]).as_quat(scalar_first=True)
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        mujoco.mj_camlight(model, data)
+
+
+def _add_skin(palette: Palette, piece: Piece, points: Float32[np.ndarray, "v 3"]) -> None:
+    """A skin that hangs on the world as a whole: its vertices are overwritten, its normals are MuJoCo's."""
+    n, name = len(points), f"person_{piece.name}"
+    options: dict[str, object] = {}
+    if piece.texture is not None and piece.uv is not None:
+        material = palette.add(name, np.ascontiguousarray(piece.texture), cube=False, shine=0.05)
+        options["texcoord"] = np.asarray(piece.uv, np.float64).ravel()
+    else:
+        material = palette.plain(name, np.asarray(piece.color, np.float64), shine=0.05)
+    palette.spec.add_skin(
+        name=name,
+        material=material,
+        vert=np.asarray(points, np.float64).ravel(),
+        face=np.asarray(piece.faces).ravel(),
+        bodyname=["world"],
+        bindpos=[0, 0, 0],
+        bindquat=[1, 0, 0, 0],
+        vertid=[list(range(n))],
+        vertweight=[[1.0] * n],
+        **options,
+    )
+
+
+def _add_marker(palette: Palette, marker: Marker) -> None:
+    image, side = plate_image(marker.id), marker.size_m * PLATE
+    if marker.on == OBJECT:
+        part = palette.spec.body(PART)
+        add_plate(palette, part, f"marker_{marker.on}", image, side, inverse(marker.T_marker_frame))
+    else:
+        carrier = palette.spec.worldbody.add_body(name=marker.on, mocap=True)
+        add_plate(palette, carrier, f"marker_{marker.on}", image, side, np.eye(4))
