@@ -97,7 +97,7 @@ def inverse(robot: Robot) -> list[list[str]]:
 
 
 def reachability(robot: Robot) -> list[list[str]]:
-    rng, n = np.random.default_rng(99), 3000
+    rng, n = np.random.default_rng(99), 2000
     q, torso = robot.sample(n, seed=55)
     near = robot.forward(q, torso)
     near[:, :3, 3] += rng.normal(0, 0.08, (n, 3))
@@ -111,7 +111,7 @@ def reachability(robot: Robot) -> list[list[str]]:
         plain, safe = score(value - field.margin <= 0, exact), score(value <= 0, exact)
         rows.append([f"field, {name}", f"{safe} with margin", f"{plain} without; {exact.mean():.0%} reachable"])
         rows.append([f"map, {name}", score(chart.reachable(T, torso) > 0.1, exact), "score above 0.1"])
-    many, heights = np.tile(level, (10, 1, 1)), np.tile(torso, 10)
+    many, heights = np.tile(level, (15, 1, 1)), np.tile(torso, 15)
     spent = min(seconds(lambda: field.distance(many, heights))[0] for _ in range(5))
     load, _ = seconds(lambda: load_field(robot))
     load_chart, _ = seconds(lambda: load_map(robot))

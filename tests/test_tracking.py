@@ -270,6 +270,7 @@ def test_in_a_gap_uncertainty_grows_and_shrinks():
         not track.observed[gap, wrist].any() and track.observed[:15, wrist].all() and track.observed[24:, wrist].all()
     )
     assert (track.source[gap, wrist] == INFERRED).all()
+    assert (track.source[:15] == OBSERVED).all() and (track.source[24:] == OBSERVED).all()
     sigma = track.sigma_m[14:25, wrist]
     assert (np.diff(sigma[:5]) > 0).all() and (np.diff(sigma[-5:]) < 0).all()
     error = np.linalg.norm(track.keypoints - moving(t), axis=2)[gap, wrist]

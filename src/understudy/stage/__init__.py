@@ -2,9 +2,3 @@
 
 Needs the extra `stage` (mujoco).
 """
-
-import os
-import sys
-
-if sys.platform == "linux":  # pictures off screen, also without a display; MuJoCo reads this when it is imported
-    os.environ.setdefault("MUJOCO_GL", "egl")

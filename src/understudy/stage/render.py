@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from dataclasses import dataclass
 from typing import Final
 
@@ -36,7 +38,7 @@ class Surfaces:
 class Renderer:
     """Draws a scene off screen. Close it, or use it in a `with` block.
 
-    Needs a GL library for MuJoCo (environment variable MUJOCO_GL; `understudy.stage` chooses egl on Linux).
+    Needs OpenGL, see `open_gl`.
     """
 
     def __init__(self, scene: Scene):
@@ -121,13 +123,17 @@ class Renderer:
 
 
 def open_gl(width: int, height: int) -> mujoco.GLContext:
-    """A GL context for pictures off screen. Raises UnderstudyError that says what to do where there is none."""
-    maker = getattr(mujoco, "GLContext", None)
-    advice = "rendering needs OpenGL: on Linux install libegl1 and libgl1-mesa-dri and set MUJOCO_GL=egl"
-    if maker is None:
-        raise UnderstudyError(advice)
+    """A GL context for pictures off screen. Raises UnderstudyError that says what to do where there is none.
+
+    On Linux it is one of EGL, which needs no display, unless the environment variable MUJOCO_GL says otherwise.
+    """
+    advice = "rendering needs OpenGL: on Linux install libegl1 and libgl1-mesa-dri, or set MUJOCO_GL=osmesa"
     try:
-        return maker(width, height)
+        if sys.platform == "linux" and os.environ.get("MUJOCO_GL", "egl") == "egl":
+            from mujoco.egl import GLContext
+        else:
+            from mujoco import GLContext
+        return GLContext(width, height)
     except Exception as e:  # MuJoCo raises what the GL binding raises: ImportError, RuntimeError, EGLError ...
         raise UnderstudyError(f"{advice} ({e})") from e
 

@@ -11,7 +11,7 @@ from scipy.special import gammainc, gammaincinv
 
 from understudy.skeleton import N_JOINTS
 from understudy.tracking.kalman import Measured
-from understudy.types import MISSING, Person
+from understudy.types import INFERRED, MISSING, OBSERVED, Person
 
 BALL: Final = float(np.sqrt(2 * gammaincinv(1.5, 0.6827)))
 """`sigma_m`, the radius of the ball that holds 68 %, in sigmas along one axis"""
@@ -35,7 +35,7 @@ def measure(
     """
     t, n = len(frames), len(ids)
     y, s = np.full((t, n, N_JOINTS, 3), np.nan), np.full((t, n, N_JOINTS), np.nan)
-    source = np.full((t, n, N_JOINTS), MISSING)
+    source = np.full((t, n, N_JOINTS), MISSING, dtype=f"U{max(map(len, (OBSERVED, INFERRED, MISSING)))}")
     confidence = np.zeros((t, n, N_JOINTS))
     column = {id: i for i, id in enumerate(ids)}
     for k, people in enumerate(frames):
