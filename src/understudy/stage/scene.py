@@ -15,7 +15,8 @@ from understudy.geometry import inverse
 from understudy.stage.furniture import Furniture
 from understudy.stage.markers import OBJECT, PLATE, Marker, plate_image
 from understudy.stage.mechanism import PART, add_furniture
-from understudy.stage.room import Palette, add_plate, add_room, furniture_materials
+from understudy.stage.palette import Palette, add_plate, furniture_materials
+from understudy.stage.room import add_room
 
 _LARGEST: Final = (1280, 720)
 """of the pictures that are rendered, pixels"""
