@@ -15,6 +15,7 @@ from understudy.camera import Camera
 from understudy.demonstration.demonstration import TASKS, Segments
 from understudy.errors import RecordingError, UnderstudyError
 from understudy.geometry import inverse, rigid, transform_points
+from understudy.objects.marker_setup import MarkerSetup
 from understudy.skeleton import JOINT
 from understudy.stage.furniture import Furniture, sample_furniture
 
@@ -25,7 +26,8 @@ from understudy.cli import stage as command  # noqa: E402
 from understudy.recordings.truth import Truth  # noqa: E402
 from understudy.stage import record as stage_record  # noqa: E402
 from understudy.stage import viewpoint  # noqa: E402
-from understudy.stage.markers import PLATE, TORSO, markers_from_json, markers_to_json, object_marker  # noqa: E402
+from understudy.stage.markers import PLATE, object_marker  # noqa: E402
+from understudy.stage.record import MARKERS  # noqa: E402
 from understudy.stage.render import Renderer, open_gl  # noqa: E402
 from understudy.stage.scene import Scene  # noqa: E402
 from understudy.stage.truth import FACTS, TRAJECTORIES, furniture_to_json, read_stage_truth  # noqa: E402
@@ -123,7 +125,6 @@ def test_a_person_s_surface_is_where_its_vertices_are_put(gl: None) -> None:
 def test_marker_is_seen_where_it_is(gl: None, task: str) -> None:
     f = sample_furniture(task, 2)
     marker = object_marker(f)
-    assert markers_from_json(markers_to_json([marker]))[0].size_m == marker.size_m
     scene = Scene(f, 2, markers=[marker])
     q = 0.15 * f.open_to
     scene.pose(q)
@@ -216,8 +217,11 @@ def test_recording_and_truth_read_back(gl: None, tmp_path: Path) -> None:
     )
     np.testing.assert_allclose(truth.T_world_object, puppet.furniture.articulation.pose(puppet.q))
     np.testing.assert_allclose(truth.T_world_hand["left"], puppet.T_world_hand["left"])
-    assert [m.on for m in truth.markers] == ["object", "right_hand", TORSO]
-    assert truth.markers[0].size_m * PLATE < 2 * puppet.furniture.panel.half_m[2]
+    assert truth.markers is not None
+    markers = truth.markers.markers
+    assert [m.on for m in markers] == ["object", "hand", "torso"]
+    assert MarkerSetup.read(folder / MARKERS).to_json() == truth.markers.to_json()
+    assert markers[0].size_m * PLATE < 2 * puppet.furniture.panel.half_m[2]
     people = Truth.read(folder / "truth.json")
     T_cam_world = inverse(truth.T_world_cam)
     for i, frame in enumerate(frames):

@@ -24,7 +24,7 @@ from understudy.stage.motion import Motion, plan_motion
 
 __all__ = ["HAND_MARKER_M", "TORSO_MARKER_M", "Performance", "Piece", "T_HAND_MARKER", "T_TORSO_MARKER", "perform"]
 
-HAND_MARKER_M: Final = 0.10
+HAND_MARKER_M: Final = 0.14
 """Side of the plate on the back of the acting hand, metres."""
 TORSO_MARKER_M: Final = 0.18
 """Side of the plate on the back, metres."""

@@ -5,41 +5,25 @@ A marker's frame: origin in its middle, x to its right and y up as one reads it,
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 
 from understudy.geometry import inverse, rigid
+from understudy.objects.marker_setup import Marker
+from understudy.objects.markers import DICTIONARIES
 from understudy.stage.furniture import Furniture
 
-DICTIONARY: Final = "DICT_APRILTAG_36h11"
+DICTIONARY: Final = "apriltag_36h11"
 PLATE: Final = 1.25
 """A plate is this much larger than its marker: one cell of white all around."""
-OBJECT, LEFT_HAND, RIGHT_HAND, TORSO = CARRIERS = ("object", "left_hand", "right_hand", "torso")
-"""What carries a marker. Their frames: the handle's; the hand's; the torso's, with its origin midway between shoulders
-and hips, z from the hips to the shoulders, x forward."""
-
+OBJECT: Final = "object"
 _CELLS: Final = 8  # of the marker's side, its black border included
 _CLEAR: Final = 0.02  # metres between the plate and the front's edges
 _BELOW_TOP: Final = 0.25  # metres from a room door's upper edge to its marker's middle
 _HAND_ROOM: Final = 0.07  # metres beside the handle's axis that a hand needs
-
-
-@dataclass(frozen=True, eq=False)
-class Marker:
-    """One marker."""
-
-    id: int
-    size_m: float
-    """side of the black square"""
-    on: str
-    """one of CARRIERS"""
-    T_marker_frame: Float[np.ndarray, "4 4"]
-    """takes points in the carrier's frame to the marker's"""
 
 
 def object_marker(furniture: Furniture, id: int = 0, size_m: float = 0.15) -> Marker:
@@ -67,22 +51,6 @@ def object_marker(furniture: Furniture, id: int = 0, size_m: float = 0.15) -> Ma
 
 def plate_image(id: int, cell: int = 16) -> UInt8[np.ndarray, "n n 3"]:
     """The whole plate, white rim included."""
-    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, DICTIONARY))
+    dictionary = cv2.aruco.getPredefinedDictionary(DICTIONARIES[DICTIONARY])
     marker = cv2.aruco.generateImageMarker(dictionary, id, _CELLS * cell)
     return np.repeat(np.pad(marker, cell, constant_values=255)[..., None], 3, axis=2)
-
-
-def markers_to_json(markers: Sequence[Marker]) -> dict[str, Any]:
-    """The marker setup as the marker tracker reads it."""
-    entries = [
-        {"id": m.id, "size_m": m.size_m, "on": m.on, "T_marker_frame": m.T_marker_frame.tolist()} for m in markers
-    ]
-    return {"dictionary": DICTIONARY, "markers": entries}
-
-
-def markers_from_json(data: dict[str, Any]) -> tuple[Marker, ...]:
-    """The inverse of `markers_to_json`."""
-    return tuple(
-        Marker(int(m["id"]), float(m["size_m"]), str(m["on"]), np.array(m["T_marker_frame"], np.float64))
-        for m in data["markers"]
-    )

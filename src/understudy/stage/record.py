@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -15,13 +16,15 @@ from tqdm import tqdm
 from understudy.camera import Camera
 from understudy.demonstration.demonstration import TASKS, Segments
 from understudy.errors import UnderstudyError, one_of
+from understudy.files import write_atomically
 from understudy.geometry import inverse, transform_points
+from understudy.objects.marker_setup import Marker, MarkerSetup
 from understudy.recordings.folder import INFO
 from understudy.recordings.truth import Truth, TruthPerson
 from understudy.recordings.writer import FolderWriter
 from understudy.stage.demonstrator import HAND_MARKER_M, T_HAND_MARKER, T_TORSO_MARKER, TORSO_MARKER_M, perform
 from understudy.stage.furniture import Furniture, sample_furniture
-from understudy.stage.markers import PLATE, TORSO, Marker, object_marker
+from understudy.stage.markers import DICTIONARY, PLATE, object_marker
 from understudy.stage.render import Renderer, Surfaces
 from understudy.stage.scene import Piece, Scene
 from understudy.stage.sensor import Sensor
@@ -30,6 +33,8 @@ from understudy.stage.viewpoint import choose_viewpoint
 from understudy.synthetic.samples import hidden_joints
 from understudy.types import Frame
 
+MARKERS: Final = "markers.json"
+"""In a recording's folder: which marker is on what, as `demonstrate --markers` reads it."""
 _NOTE: Final = "stage; limb joints are centres of rotation, the neck is the midpoint of the shoulders"
 
 
@@ -120,9 +125,11 @@ def record_performance(
 ) -> Path:
     """Records one performance; `settings` are noted in its truth. Returns the folder."""
     folder = Path(folder)
-    eye = Sensor(sensor, seed)
-    plates = _markers(furniture, performance) if markers else ()
-    scene = Scene(furniture, seed, performance.pieces, performance.vertices(0), plates)
+    eye = Sensor(sensor, seed, fine_color=markers)
+    plates = _markers(furniture) if markers else None
+    scene = Scene(
+        furniture, seed, performance.pieces, performance.vertices(0), () if plates is None else plates.markers
+    )
     hand = performance.T_world_hand[performance.acting]
     T_world_cam = choose_viewpoint(scene, performance, hand, eye.camera, seed).T_world_cam
     times = np.asarray(performance.times_s, np.float64)
@@ -131,6 +138,8 @@ def record_performance(
     writer = FolderWriter(folder, eye.camera, fps=fps, overwrite=interrupted)
     truth = _stage_truth(furniture, performance, seed, settings or {}, T_world_cam, plates)
     write_stage_truth(folder, truth)
+    if plates is not None:
+        write_atomically(folder / MARKERS, json.dumps(plates.to_json(), indent=1) + "\n")
     people: dict[int, tuple[TruthPerson, ...]] = {}
     small = eye.camera.color.scale(0.5)  # is enough to tell what hides a joint
     with Renderer(scene) as renderer:
@@ -165,7 +174,7 @@ def _stage_truth(
     seed: int,
     settings: Mapping[str, Any],
     T_world_cam: Float[np.ndarray, "4 4"],
-    plates: Sequence[Marker],
+    plates: MarkerSetup | None,
 ) -> StageTruth:
     q = np.asarray(performance.q, np.float64)
     return StageTruth(
@@ -181,23 +190,26 @@ def _stage_truth(
         np.asarray(performance.joints, np.float64),
         performance.acting,
         performance.segments,
-        tuple(plates),
+        plates,
     )
 
 
-def _markers(furniture: Furniture, performance: Performance) -> tuple[Marker, ...]:
+def _markers(furniture: Furniture) -> MarkerSetup:
     """On the furniture, the back of the acting hand, and the person's back."""
-    return (
-        object_marker(furniture),
-        Marker(1, HAND_MARKER_M / PLATE, f"{performance.acting}_hand", inverse(T_HAND_MARKER)),
-        Marker(2, TORSO_MARKER_M / PLATE, TORSO, inverse(T_TORSO_MARKER)),
+    return MarkerSetup(
+        DICTIONARY,
+        (
+            object_marker(furniture),
+            Marker(1, HAND_MARKER_M / PLATE, "hand", inverse(T_HAND_MARKER)),
+            Marker(2, TORSO_MARKER_M / PLATE, "torso", inverse(T_TORSO_MARKER)),
+        ),
     )
 
 
 def _carried(performance: Performance, i: int) -> dict[str, Float[np.ndarray, "4 4"]]:
     """Carrier -> T_world_marker at sample i, of the markers that the person carries."""
     poses = performance.marker_poses(i)
-    return {f"{performance.acting}_hand": poses["hand"], TORSO: poses["torso"]}
+    return {"hand": poses["hand"], "torso": poses["torso"]}
 
 
 def _person(

@@ -12,8 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from understudy.demonstration.demonstration import TASKS
 from understudy.geometry import inverse
+from understudy.objects.marker_setup import Marker
 from understudy.stage.furniture import Furniture
-from understudy.stage.markers import OBJECT, PLATE, Marker, plate_image
+from understudy.stage.markers import OBJECT, PLATE, plate_image
 from understudy.stage.mechanism import PART, add_furniture
 from understudy.stage.palette import Palette, add_plate, furniture_materials
 from understudy.stage.room import add_room

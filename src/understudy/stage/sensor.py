@@ -31,8 +31,10 @@ _NOISE: Final = 0.008  # of full scale
 class Sensor:
     """One unit of a kind of sensor, with the small differences that units have."""
 
-    def __init__(self, name: str, seed: int):
-        """Raises UnderstudyError for a kind of sensor that there is not."""
+    def __init__(self, name: str, seed: int, fine_color: bool = False):
+        """fine_color: twice the usual number of pixels each way, for markers. Raises UnderstudyError for a kind of
+        sensor that there is not.
+        """
         if name not in IMAGES:
             raise UnderstudyError(f"sensor {name!r}: must be {one_of(IMAGES)}")
         self._seed = seed
@@ -46,7 +48,8 @@ class Sensor:
             made.append(Camera(width, height, np.array([[f, 0, cx], [0, f, cy], [0, 0, 1.0]])))
         c, s = np.cos(float(self._rig.pitch)), np.sin(float(self._rig.pitch))
         R = np.array([[1.0, 0, 0], [0, c, s], [0, -s, c]])
-        self.camera = RGBDCamera(made[0], made[1], rigid(R, self._rig.baseline[0].double().numpy()))
+        color = made[0].scale(2.0) if fine_color else made[0]
+        self.camera = RGBDCamera(color, made[1], rigid(R, self._rig.baseline[0].double().numpy()))
 
     def _draw(self, number: int) -> Draw:
         return Draw((self._seed * 1_000_003 + 700_000 + number) % 2**63)

@@ -22,8 +22,8 @@ from understudy.demonstration.demonstration import Segments
 from understudy.errors import RecordingError, UnderstudyError
 from understudy.files import read_json, write_atomically
 from understudy.objects.articulation import Articulation, Handle
+from understudy.objects.marker_setup import MarkerSetup
 from understudy.stage.furniture import Box, Dynamics, Furniture
-from understudy.stage.markers import Marker, markers_from_json, markers_to_json
 
 FACTS: Final = "stage_truth.json"
 TRAJECTORIES: Final = "stage_truth.npz"
@@ -65,7 +65,7 @@ class StageTruth:
     acting: str
     """which hand: left or right"""
     segments: Segments
-    markers: tuple[Marker, ...] = ()
+    markers: MarkerSetup | None = None
 
     @property
     def task(self) -> str:
@@ -84,7 +84,7 @@ def write_stage_truth(folder: Path, truth: StageTruth) -> None:
         "acting": truth.acting,
         "segments": {"grasp": truth.segments.grasp, "release": truth.segments.release},
         "furniture": furniture_to_json(truth.furniture),
-        "markers": markers_to_json(truth.markers),
+        "markers": None if truth.markers is None else truth.markers.to_json(),
     }
     write_atomically(folder / FACTS, json.dumps(facts, indent=1, allow_nan=False))
     arrays = {
@@ -122,7 +122,7 @@ def read_stage_truth(folder: str | Path) -> StageTruth:
             arrays["joints"],
             str(facts["acting"]),
             Segments(int(facts["segments"]["grasp"]), int(facts["segments"]["release"])),
-            markers_from_json(facts["markers"]),
+            None if facts["markers"] is None else MarkerSetup.from_json(facts["markers"], f"{path}: markers"),
         )
     except UnderstudyError:
         raise
