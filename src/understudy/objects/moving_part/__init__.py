@@ -1,0 +1,5 @@
+"""The moving part of furniture without markers: door leaf, cabinet door, drawer, sliding door, from depth."""
+
+from understudy.objects.moving_part.finder import HandHint, MovingPart, MovingPartConfig, find_moving_part
+
+__all__ = ["HandHint", "MovingPart", "MovingPartConfig", "find_moving_part"]
