@@ -23,11 +23,12 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 import adaptation_scenes as scenes
 
 from understudy.adaptation import edges, prepare
-from understudy.adaptation.adapt import SCHEDULE, adapt
+from understudy.adaptation.adapt import adapt
 from understudy.adaptation.calibration import DEFAULT_HAND_TOOL, Calibration
-from understudy.adaptation.graph import Graph, Margins, State, Weights
+from understudy.adaptation.graph import Graph, State
 from understudy.adaptation.platform import Platform
 from understudy.adaptation.solver import Chain, Linear, Stop, minimise
+from understudy.adaptation.weights import SCHEDULE, Margins, Weights
 
 FULL = replace(SCHEDULE[-1], kernel="none")
 TOLERANCE = 1e-5

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from understudy.demonstration import clock, storage
 from understudy.demonstration.alignment import align, on_floor, phase
 from understudy.demonstration.demonstration import FREE, OCCUPIED, UNKNOWN, Demonstration, Segments
-from understudy.demonstration.scene_map import RESOLUTION, View, occupancy, static_scene
+from understudy.demonstration.scene_map import RESOLUTION, Sweep, View, occupancy, static_scene
 from understudy.demonstration.segments import MOVING, find_segments, measure_motion
 from understudy.errors import RecordingError, UnderstudyError
 from understudy.floor import find_floor, world_from_camera
@@ -242,8 +242,8 @@ def test_the_map_holds_the_furniture_but_not_the_person_who_passes():
 def test_the_moving_part_is_not_in_the_scene():
     T = looking()
     views = [View(cast(T, [CUPBOARD]), np.zeros((0, 18, 3))) for _ in range(3)]
-    front = np.stack(np.meshgrid([2.5], np.arange(-0.5, 0.4, 0.02), np.arange(0, 1, 0.02)), -1).reshape(-1, 3)
-    scene = static_scene(views, T, [front])
+    front = Sweep(np.eye(4)[None], np.array([2.49, -0.5, 0.0]), np.array([2.51, 0.4, 1.0]))
+    scene = static_scene(views, T, front)
     low, high = CUPBOARD
     on_front = (np.abs(scene[:, 0] - low[0]) < 0.04) & (scene[:, 2] > 0.1) & (scene[:, 2] < high[2] - 0.1)
     assert not on_front.any() and len(scene)

@@ -9,10 +9,23 @@ import warnings
 from collections.abc import Sequence
 
 from understudy import __version__
-from understudy.cli import benchmark, compare, demonstrate, estimate, info, models, stage, synth, train, view, weights
+from understudy.cli import (
+    adapt,
+    benchmark,
+    compare,
+    demonstrate,
+    estimate,
+    info,
+    models,
+    stage,
+    synth,
+    train,
+    view,
+    weights,
+)
 from understudy.errors import MissingExtraError, UnderstudyError
 
-_GROUPS = (estimate, view, info, models, compare, benchmark, demonstrate, stage, synth, train, weights)
+_GROUPS = (estimate, view, info, models, compare, benchmark, demonstrate, adapt, stage, synth, train, weights)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

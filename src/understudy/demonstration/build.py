@@ -17,11 +17,11 @@ from understudy.demonstration.actor import Candidate, reaching_hands
 from understudy.demonstration.body_tracks import hand_track, hold, on_the_floor, torso_track
 from understudy.demonstration.demonstration import Demonstration
 from understudy.demonstration.object_track import ObjectTrack, by_depth, by_markers
-from understudy.demonstration.scene_map import View, occupancy, static_scene
+from understudy.demonstration.scene_map import Sweep, View, occupancy, static_scene
 from understudy.demonstration.segments import find_segments
 from understudy.errors import UnderstudyError, one_of
 from understudy.floor import Floor, find_floor, world_from_camera
-from understudy.geometry import transform_points
+from understudy.geometry import inverse, transform_points
 from understudy.objects.articulation import FIXED, REVOLUTE, Articulation
 from understudy.objects.marker_setup import MarkerSetup, track_markers
 from understudy.objects.moving_part.finder import HandHint
@@ -38,6 +38,7 @@ RGBD, MARKERS = SOURCES = ("rgbd", "markers")
 
 _VIEWS = 14  # frames that the static scene is made of
 _FLOOR_VIEWS, _FLOOR_POINTS = 5, 20_000
+_POSES = 24  # of the moving part, between closed and open
 _CACHED = 24  # decoded frames kept in memory
 _ALIKE = 0.6  # a hand that reaches at least so much as the first is tried, too
 
@@ -240,11 +241,21 @@ def _joints(people: Sequence[Person]) -> Float[np.ndarray, "k 18 3"]:
     return np.array([p.keypoints for p in people]).reshape(-1, 18, 3)
 
 
-def _swept(thing: ObjectTrack) -> list[np.ndarray]:
-    """The moving part in poses from closed to open, world."""
+def _swept(thing: ObjectTrack) -> Sweep | None:
+    """The moving part from closed to open; None if nothing is known of its shape.
+
+    A hinged part reaches to its axis, also where the person hid that.
+    """
+    if not len(thing.part):
+        return None
+    corners = np.percentile(thing.part, [1, 99], axis=0)
+    if thing.articulation.kind == REVOLUTE:
+        axis = transform_points(inverse(thing.articulation.T_rest), thing.articulation.point)
+        corners = np.concatenate(
+            [corners, np.where(np.abs(thing.articulation.in_part().direction) > 0.7, 0, axis)[None]]
+        )
     low, high = thing.articulation.range
-    poses = thing.articulation.pose(np.linspace(low, high, 8))
-    return [transform_points(T, thing.part.astype(np.float64)) for T in poses]
+    return Sweep(thing.articulation.pose(np.linspace(low, high, _POSES)), corners.min(axis=0), corners.max(axis=0))
 
 
 def _source(

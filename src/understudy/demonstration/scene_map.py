@@ -8,7 +8,6 @@ from typing import Final
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
-from scipy.spatial import cKDTree
 
 from understudy.demonstration.demonstration import FREE, OCCUPIED, UNKNOWN, OccupancyMap
 from understudy.geometry import inverse, transform_points
@@ -27,7 +26,7 @@ _POINTS = 40_000  # of a frame
 _BODY = 0.25  # metres around the bones that belong to the person (clothes, and the error of joints)
 _BEHIND = 0.10  # metres: measured so much farther away means that nothing was there
 _FARTHEST = 6.0  # metres from the camera: beyond, depth is not worth a map
-_STAYS = 0.6  # least share of the looks at a place that found something
+_STAYS = 0.75  # least share of the looks at a place that found something
 _PART = 0.06  # metres around the moving part
 _RAYS, _LOW = 3000, 0.5  # rays of a frame that clear the way; below this height, metres
 _WALKED = 0.20  # metres around where the person walked
@@ -42,13 +41,31 @@ class View:
     """of k people, colour camera's frame, metres; NaN rows are allowed"""
 
 
+@dataclass(frozen=True, eq=False)
+class Sweep:
+    """The room that the moving part takes: a box in some of its poses."""
+
+    T_world_part: Float[np.ndarray, "n 4 4"]
+    low: Float[np.ndarray, "3"]
+    high: Float[np.ndarray, "3"]
+    """corners of the box in the part's frame"""
+
+    def holds(self, points: Float[np.ndarray, "n 3"], margin: float) -> Bool[np.ndarray, " n"]:
+        """Which points (world) are in the box in any pose, or so near to it."""
+        inside = np.zeros(len(points), bool)
+        for T in self.T_world_part:
+            own = transform_points(inverse(T), points)
+            inside |= ((own > self.low - margin) & (own < self.high + margin)).all(axis=1)
+        return inside
+
+
 def static_scene(
-    views: Sequence[View], T_world_cam: Float[np.ndarray, "4 4"], part: Sequence[Float[np.ndarray, "_ 3"]] = ()
+    views: Sequence[View], T_world_cam: Float[np.ndarray, "4 4"], sweep: Sweep | None = None
 ) -> Float32[np.ndarray, "n 3"]:
     """Points (world, one for each voxel) of what stayed in its place.
 
     A place counts when most looks at it found a surface: looks in which something nearer hid it say nothing; looks that
-    went through it speak against it. part: points of the moving part in some of its poses (world); they are left out.
+    went through it speak against it. sweep: of the moving part; what is there is left out.
     """
     T_cam_world = inverse(T_world_cam)
     clouds = [transform_points(T_world_cam, _without_people(view).astype(np.float64)) for view in views]
@@ -64,9 +81,8 @@ def static_scene(
     if len(views) > 2:
         keep &= hits > 1
     points = center[keep]
-    for pose in part:
-        if len(pose) and len(points):
-            points = points[cKDTree(pose).query(points, distance_upper_bound=_PART)[0] > _PART]
+    if sweep is not None:
+        points = points[~sweep.holds(points, _PART)]
     return points.astype(np.float32)
 
 

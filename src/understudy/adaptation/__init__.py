@@ -1,0 +1,1 @@
+"""Adaptation: the graph that bends a demonstration into what a robot can do (docs/adaptation.md)."""

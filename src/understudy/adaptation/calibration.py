@@ -1,0 +1,83 @@
+"""X (hand to gripper) and Y (torso to base): fixed transforms between the teacher's body and the robot's."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from jaxtyping import Float
+
+from understudy import lie
+from understudy.demonstration.demonstration import Demonstration
+
+_SPREAD: Final = np.array([0.05] * 3 + [np.radians(20)] * 3)  # residuals of this size lose half of their weight
+_ROUNDS: Final = 20
+
+
+def _default_hand_tool() -> Float[np.ndarray, "4 4"]:
+    """The gripper approaches where the palm faces and closes along the fingers; its middle is 3 cm before the palm."""
+    T = np.eye(4)
+    T[:3, :3] = np.array([[0, 1, 0], [0, 0, 1], [1, 0, 0.0]])  # columns: tool x = hand z, y = hand x, z = hand y
+    T[:3, 3] = (0.02, 0, 0.03)
+    return T
+
+
+DEFAULT_HAND_TOOL: Final = _default_hand_tool()
+"""X: T_hand_tool"""
+DEFAULT_TORSO_BASE: Final = np.array([-0.2, 0.0, 0.0])
+"""Y: (x, y, yaw) of the base seen from the torso: somewhat farther from the work, for a base is wider than a person"""
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """How the robot stands in for the teacher. Fixed for all demonstrations of a task."""
+
+    T_hand_tool: Float[np.ndarray, "4 4"]
+    """X: a gripper at H X is where the hand is"""
+    torso_base: Float[np.ndarray, "3"]
+    """Y: metres, metres, radians; a base at P Y is where the torso is"""
+
+    @classmethod
+    def default(cls) -> Calibration:
+        """Without looking at any demonstration."""
+        return cls(DEFAULT_HAND_TOOL.copy(), DEFAULT_TORSO_BASE.copy())
+
+
+def mean_pose(T: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "4 4"]:
+    """Karcher mean, robust (Cauchy weights): n poses of which some may be far off."""
+    start = int(np.argmin(np.linalg.norm(T[:, :3, 3] - np.median(T[:, :3, 3], axis=0), axis=1)))
+    mean = T[start]
+    for _ in range(_ROUNDS):
+        e = lie.se3_log(lie.se3_inverse(mean) @ T)
+        weight = 1 / (1 + np.sum((e / _SPREAD) ** 2, axis=1))
+        step = (weight @ e) / weight.sum()
+        mean = mean @ lie.se3_exp(step)
+        if np.abs(step).max() < 1e-10:
+            break
+    return mean
+
+
+def hands_on_object(demonstration: Demonstration) -> Float[np.ndarray, "n 4 4"]:
+    """T_object_hand of all samples of the manipulation where hand and object are known and measured."""
+    d = demonstration
+    holding = np.zeros(len(d), bool)
+    holding[d.segments.slices(len(d))["manipulate"]] = True
+    use = holding & d.hand.observed & d.hand.oriented & d.hand.known & d.object.known
+    return lie.se3_inverse(d.object.T_world_x[use]) @ d.hand.T_world_x[use]
+
+
+def typical_hands(demonstrations: Sequence[Demonstration]) -> Float[np.ndarray, "d 4 4"]:
+    """The mean hand in the object's frame of every demonstration that shows one."""
+    shown = [hands_on_object(d) for d in demonstrations]
+    means = [mean_pose(T) for T in shown if len(T)]
+    return np.array(means) if means else np.zeros((0, 4, 4))
+
+
+def estimate_hand_tool(
+    demonstrations: Sequence[Demonstration], grasp: Float[np.ndarray, "4 4"]
+) -> Float[np.ndarray, "4 4"]:
+    """X, the mean of H^-1 O g over how the hands hold the object. The default if no hand is seen."""
+    hands = typical_hands(demonstrations)
+    return mean_pose(lie.se3_inverse(hands) @ grasp) if len(hands) else DEFAULT_HAND_TOOL.copy()
