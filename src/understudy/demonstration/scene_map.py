@@ -8,6 +8,7 @@ from typing import Final
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
+from scipy.spatial import cKDTree
 
 from understudy.demonstration.demonstration import FREE, OCCUPIED, UNKNOWN, OccupancyMap
 from understudy.geometry import inverse, transform_points
@@ -27,6 +28,7 @@ _BODY = 0.25  # metres around the bones that belong to the person (clothes, and 
 _BEHIND = 0.10  # metres: measured so much farther away means that nothing was there
 _FARTHEST = 6.0  # metres from the camera: beyond, depth is not worth a map
 _STAYS = 0.75  # least share of the looks at a place that found something
+_COMPANY = 2  # neighbours that a voxel needs
 _PART = 0.06  # metres around the moving part
 _RAYS, _LOW = 3000, 0.5  # rays of a frame that clear the way; below this height, metres
 _WALKED = 0.20  # metres around where the person walked
@@ -80,10 +82,20 @@ def static_scene(
     keep = hits >= _STAYS * (hits + through)
     if len(views) > 2:
         keep &= hits > 1
-    points = center[keep]
+    points = _without_specks(center[keep])
     if sweep is not None:
         points = points[~sweep.holds(points, _PART)]
     return points.astype(np.float32)
+
+
+def _without_specks(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
+    """Without voxels that (almost) stand alone in the air: noise, or what is left of a person."""
+    if not len(points):
+        return points
+    tree = cKDTree(points)
+    neighbours = tree.query_ball_point(points, 1.8 * VOXEL, return_length=True) - 1
+    kept: Float[np.ndarray, "m 3"] = points[np.asarray(neighbours) >= _COMPANY]
+    return kept
 
 
 def occupancy(

@@ -20,22 +20,23 @@ FORMATS: tuple[type[Recording], ...] = (
 )
 """Asked in this order; the first that recognizes a path opens it."""
 
-SAMPLE = "sample"
-"""The name that stands for the bundled recording (a folder of that name is opened as './sample')."""
+SAMPLES = {"sample": "room", "sample-drawer": "drawer"}
+"""Names that stand for the bundled recordings (a folder of such a name is opened as './sample'), and their folders:
+people in a room; a person who opens a drawer."""
 
 
-def sample_path() -> Path:
-    """The recording that comes with the package."""
-    return Path(__file__).resolve().parents[1] / "samples" / "room"
+def sample_path(name: str = "sample") -> Path:
+    """A recording that comes with the package: one of `SAMPLES`."""
+    return Path(__file__).resolve().parents[1] / "samples" / SAMPLES[name]
 
 
 def open(path: str | Path, **options: Any) -> Recording:  # shadows the builtin here, on purpose: recordings.open(...)
-    """Opens a recording of any known format; 'sample' is the one that comes with the package.
+    """Opens a recording of any known format; 'sample' and 'sample-drawer' come with the package.
 
     `options` go to the format (for example `K` for a TUM sequence). Raises RecordingError if the path does not exist,
     is of no known format or cannot be read as a whole.
     """
-    place = sample_path() if str(path) == SAMPLE else Path(path)
+    place = sample_path(str(path)) if str(path) in SAMPLES else Path(path)
     try:
         exists = place.exists()
     except (OSError, ValueError) as e:  # names with a NUL, too long names
