@@ -21,6 +21,7 @@ from understudy.demonstration.build import DemonstrationConfig, build
 from understudy.demonstration.demonstration import Demonstration
 from understudy.errors import MissingExtraError, RecordingError, UnderstudyError
 from understudy.files import read_json, write_atomically
+from understudy.people_file import PeopleFile
 from understudy.pipeline import PEOPLE, estimate_recording
 from understudy.registration import register
 
@@ -63,7 +64,7 @@ def demonstrate(
     for path, folder in zip(paths, folders, strict=True):
         try:
             with recordings.open(path) as recording:
-                people = estimate_recording(
+                estimate_recording(
                     recording,
                     folder / ESTIMATION,
                     method=method,
@@ -74,6 +75,8 @@ def demonstrate(
                     restart=restart,
                     progress=progress,
                 )
+                # read back: a run that goes on where another stopped must see the very same (rounded) numbers
+                people = PeopleFile.read(folder / ESTIMATION / PEOPLE)
                 key = _key(folder / ESTIMATION / PEOPLE, config)
                 demo = None if restart else _finished(folder, key)
                 if demo is None:
