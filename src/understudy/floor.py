@@ -20,7 +20,8 @@ MIN_SHARE = 0.06
 MAX_BELOW = 0.03
 """share of the points, under the floor: else it is a table"""
 
-_SAMPLES, _TRIES = 4000, 400
+_SAMPLES, _TRIES = 4000, 600
+_LOW = 0.35  # share of the points that are lowest in the camera's frame
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +62,10 @@ def _fit(points: Float[np.ndarray, "n 3"]) -> Floor | None:
         return None
     random = np.random.default_rng(0)
     points = points[random.permutation(len(points))[:_SAMPLES]]
-    a, b, c = points[random.integers(len(points), size=(3, _TRIES))]
+    some = random.integers(len(points), size=(3, _TRIES))
+    low = np.argsort(-points[:, 1])[: int(_LOW * len(points))]  # where little of the floor is to be seen, it is there
+    some[:, ::2] = low[random.integers(len(low), size=some[:, ::2].shape)]
+    a, b, c = points[some]
     normals = np.cross(b - a, c - a)
     length = np.linalg.norm(normals, axis=1)
     upright = np.abs(normals @ CAMERA_UP) > np.cos(MAX_TILT) * np.maximum(length, 1e-9)

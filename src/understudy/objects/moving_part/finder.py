@@ -204,10 +204,10 @@ class _Finder:
         return grow(self.scorer, self.ref, model, articulation, motion.q[picked], picked)
 
     def _trusted(self, articulation: Articulation, motion: Motion) -> Bool[np.ndarray, " t"]:
-        """Usable frames in which the hand is where the handle should be, and those at rest."""
+        """Usable frames in which the hand is where the handle should be, and those in which nobody holds it."""
         cost = hand_cost(articulation, motion.q[:, None], self.hand.positions, self.hand.sigma_m)[:, 0]
         near = minimum_filter1d(cost, 3, mode="nearest") < 0.5
-        return self.stack.usable & (near | (motion.q == 0))
+        return self.stack.usable & (near | ~motion.held)
 
     def _tracked(self, h: Hypothesis) -> _Tracked | None:
         motion = self._follow(h.panel.model, h.articulation, 80, 0.025)
