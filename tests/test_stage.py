@@ -302,3 +302,17 @@ def test_camera_sees_hand_and_handle() -> None:
         eye = view.T_world_cam[:3, 3]
         assert seen.all() and eye[0] < -0.4 and 1.3 <= eye[2] <= 2.2
         assert 1.9 < np.linalg.norm(eye - grip[0]) < 3.6
+
+
+def test_large_pictures_are_drawn_whole(gl: None) -> None:
+    """Twice the usual size (as with markers) shows what half of it shows; what is too large is refused."""
+    f = sample_furniture("drawer", 4)
+    T_world_cam = look_at(np.array([-2.2, -1.2, 1.5]), np.array([0.0, 0.0, 0.8]))
+    small = Camera(640, 360, np.array([[360.0, 0, 319.5], [0, 360.0, 179.5], [0, 0, 1]]))
+    with Renderer(Scene(f, 4)) as renderer:
+        renderer.update()
+        large = renderer.color(small.scale(3.0), T_world_cam).reshape(360, 3, 640, 3, 3).mean(axis=(1, 3))
+        apart = np.abs(large - renderer.color(small, T_world_cam))
+        assert np.median(apart) < 4 and apart.mean() < 8
+        with pytest.raises(UnderstudyError, match="larger than the stage can draw"):
+            renderer.color(small.scale(5.0), T_world_cam)

@@ -99,6 +99,12 @@ class Renderer:
     def _render(
         self, context: mujoco.MjrContext, camera: Camera, T_world_cam: Float[np.ndarray, "4 4"], ids: bool
     ) -> None:
+        offscreen = self._scene.model.vis.global_
+        if camera.width > offscreen.offwidth or camera.height > offscreen.offheight:
+            raise UnderstudyError(
+                f"a picture of {camera.width} x {camera.height} is larger than the stage can draw: "
+                f"{offscreen.offwidth} x {offscreen.offheight}"
+            )
         self._gl.make_current()
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, context)
         flags = self._view.flags

@@ -19,7 +19,7 @@ from understudy.stage.mechanism import PART, add_furniture
 from understudy.stage.palette import Palette, add_plate, furniture_materials
 from understudy.stage.room import add_room
 
-_LARGEST: Final = (1280, 720)
+_LARGEST: Final = (2560, 1440)
 """of the pictures that are rendered, pixels"""
 
 
