@@ -18,7 +18,7 @@ from understudy.demonstration.body_tracks import hand_track, hold, on_the_floor,
 from understudy.demonstration.demonstration import Demonstration
 from understudy.demonstration.object_track import ObjectTrack, by_depth, by_markers
 from understudy.demonstration.scene_map import Sweep, View, occupancy, static_scene
-from understudy.demonstration.segments import find_segments
+from understudy.demonstration.segments import MOVING, find_segments, measure_motion
 from understudy.errors import UnderstudyError, one_of
 from understudy.floor import Floor, find_floor, world_from_camera
 from understudy.geometry import inverse, transform_points
@@ -38,6 +38,7 @@ RGBD, MARKERS = SOURCES = ("rgbd", "markers")
 
 _VIEWS = 14  # frames that the static scene is made of
 _FLOOR_VIEWS, _FLOOR_POINTS = 5, 20_000
+_ENOUGH = 0.5  # share of the motion for which a hand must be known to be judged by its distance
 _POSES = 24  # of the moving part, between closed and open
 _CACHED = 24  # decoded frames kept in memory
 _ALIKE = 0.6  # a hand that reaches at least so much as the first is tried, too
@@ -189,29 +190,44 @@ def _object(
     hands = reaching_hands(body.tracks, body.T_world_cam)
     try:
         if config.object == MARKERS:
-            return by_markers(_carried(body, "object")), hands[0]
-        return _found(frames, [people[i].people for i in frames.rows(people)], body, hands)
+            thing = by_markers(_carried(body, "object"))
+        else:
+            thing = _found(frames, [people[i].people for i in frames.rows(people)], body, hands)
+        return thing, _who_moves(thing, body.times[frames.rows(people)], body, hands)
     except UnderstudyError as e:
         raise UnderstudyError(f"{frames.recording.path}: {e}") from e
 
 
-def _found(
-    frames: Frames, seen: Sequence[Sequence[Person]], body: _Body, hands: Sequence[Candidate]
-) -> tuple[ObjectTrack, Candidate]:
-    """Of the hands that reach, the one with which an object is found best."""
+def _found(frames: Frames, seen: Sequence[Sequence[Person]], body: _Body, hands: Sequence[Candidate]) -> ObjectTrack:
+    """The object that is found best with one of the hands that reach."""
     times = body.times[frames.rows(body.people)]
-    found: list[tuple[ObjectTrack, Candidate]] = []
+    found: list[ObjectTrack] = []
     complaints: list[UnderstudyError] = []
     for hand in [h for h in hands if h.reaching_s >= _ALIKE * hands[0].reaching_s][:2]:
         track = clock.resample_poses(body.hand(hand), hand.track.times_s, times)
         sigma = np.sqrt(np.trace(track.covariance[:, :3, :3], axis1=1, axis2=2))
         try:
-            found.append((by_depth(frames, seen, body.T_world_cam, HandHint(times, track.positions, sigma)), hand))
+            found.append(by_depth(frames, seen, body.T_world_cam, HandHint(times, track.positions, sigma)))
         except UnderstudyError as e:
             complaints.append(e)
     if not found:
         raise complaints[0]
-    return max(found, key=lambda pair: pair[0].evidence)
+    return max(found, key=lambda thing: thing.evidence)
+
+
+def _who_moves(
+    thing: ObjectTrack, times: Float[np.ndarray, " n"], body: _Body, hands: Sequence[Candidate]
+) -> Candidate:
+    """The hand that is at the handle while the object moves; the one that reaches most if none is seen there."""
+    way = _way(thing.articulation, thing.track)
+    moving = np.abs(measure_motion(times, way).speed) > MOVING
+    apart = []
+    for hand in hands:
+        positions = clock.resample_poses(body.hand(hand), hand.track.times_s, times).positions
+        away = np.linalg.norm(positions - thing.track.positions, axis=1)[moving]
+        away = away[np.isfinite(away)]
+        apart.append(float(np.median(away)) if len(away) >= _ENOUGH * moving.sum() and len(away) else np.inf)
+    return hands[int(np.argmin(apart))]
 
 
 def _carried(body: _Body, on: str) -> PoseTrack:
