@@ -12,7 +12,7 @@ PAGES := benchmarks/paper_tables.py benchmarks/palms.py benchmarks/demonstration
 .PHONY: demo test check format bench clean help
 
 help:
-	@echo "make demo    set up, then estimate the people of the bundled recording and draw them (into demo/)"
+	@echo "make demo    set up, then estimate the people of a bundled recording, and teach a robot from another (into demo/)"
 	@echo "make test    set up, then run the tests"
 	@echo "make check   set up, then ruff and mypy"
 	@echo "make format  let ruff rewrite the code in its style"
@@ -23,9 +23,11 @@ demo: $(VENV)/user.stamp
 	$(BIN)/understudy models fetch
 	$(BIN)/understudy estimate sample --out demo
 	$(BIN)/understudy compare sample --out demo/compare.png
+	$(BIN)/understudy teach sample-drawer --task drawer --robot pr2 --out demo/drawer
 	@echo; echo "Made by 'make demo' (look at these):"; ls demo/overlays/*.png; echo demo/people.json; \
 	  echo "demo/compare.png: network and naive lifting side by side, on a person whom the desk hides"; \
-	  echo "In 3D: $(BIN)/understudy view demo"
+	  echo "In 3D: $(BIN)/understudy view demo"; \
+	  echo "What the robot learnt, and its video: demo/drawer/report.html"
 
 test: $(VENV)/dev.stamp
 	$(BIN)/understudy models fetch
@@ -53,7 +55,7 @@ $(VENV)/bin/python:
 	$(PYTHON) -m venv $(VENV)
 
 $(VENV)/user.stamp: pyproject.toml | $(VENV)/bin/python
-	$(BIN)/pip install -q -e '.[all]'
+	$(BIN)/pip install -q -e '.[all,robot]'
 	@touch $@
 
 $(VENV)/dev.stamp: pyproject.toml | $(VENV)/bin/python

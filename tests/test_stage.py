@@ -12,7 +12,8 @@ import pytest
 
 from understudy import recordings
 from understudy.camera import Camera
-from understudy.demonstration.demonstration import TASKS, Segments
+from understudy.demonstration.demonstration import Segments
+from understudy.demonstration.tasks import TASKS
 from understudy.errors import RecordingError, UnderstudyError
 from understudy.geometry import inverse, rigid, transform_points
 from understudy.objects.marker_setup import MarkerSetup

@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from understudy.demonstration.demonstration import TASKS
+from understudy.demonstration.tasks import TASKS
 from understudy.errors import UnderstudyError
 from understudy.geometry import inverse, transform_points
 from understudy.skeleton import JOINT

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from understudy.demonstration.demonstration import TASKS
+from understudy.demonstration.tasks import TASKS
 from understudy.errors import UnderstudyError
 from understudy.stage.furniture import Furniture, sample_furniture
 

@@ -19,13 +19,30 @@ from understudy.cli import (
     models,
     stage,
     synth,
+    teach,
     train,
+    trials,
     view,
     weights,
 )
 from understudy.errors import MissingExtraError, UnderstudyError
 
-_GROUPS = (estimate, view, info, models, compare, benchmark, demonstrate, adapt, stage, synth, train, weights)
+_GROUPS = (
+    estimate,
+    view,
+    info,
+    models,
+    compare,
+    benchmark,
+    demonstrate,
+    adapt,
+    teach,
+    trials,
+    stage,
+    synth,
+    train,
+    weights,
+)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from understudy.cli.common import command, needs_extra
-from understudy.demonstration.demonstration import TASKS
+from understudy.demonstration.tasks import TASKS
 
 _ALL = "all"
 

@@ -24,7 +24,7 @@ from understudy.floor import Floor, find_floor, world_from_camera
 from understudy.geometry import inverse, transform_points
 from understudy.objects.articulation import FIXED, REVOLUTE, Articulation
 from understudy.objects.marker_setup import MarkerSetup, track_markers
-from understudy.objects.moving_part.finder import HandHint
+from understudy.objects.moving_part import HandHint
 from understudy.people_file import FramePeople
 from understudy.recordings.base import Recording
 from understudy.registration import register
@@ -41,6 +41,7 @@ _FLOOR_VIEWS, _FLOOR_POINTS = 5, 20_000
 _ENOUGH = 0.5  # share of the motion for which a hand must be known to be judged by its distance
 _POSES = 24  # of the moving part, between closed and open
 _CACHED = 24  # decoded frames kept in memory
+_SURE_M = 0.075  # sigma of a hand that may say that it has left: one that the body hides is often far off
 _ALIKE = 0.6  # a hand that reaches at least so much as the first is tried, too
 
 
@@ -96,7 +97,8 @@ def build(
     else:
         hand = clock.resample_poses(body.hand(actor), actor.track.times_s, even)
         torso = clock.resample_planar(torso_track(actor.track, T_world_cam), actor.track.times_s, even)
-    apart = np.where(hand.observed, np.linalg.norm(hand.positions - object.positions, axis=1), np.nan)
+    sure = hand.observed & (np.sqrt(np.trace(hand.covariance[:, :3, :3], axis1=1, axis2=2)) < _SURE_M)
+    apart = np.where(sure, np.linalg.norm(hand.positions - object.positions, axis=1), np.nan)
     segments = find_segments(even, _way(thing.articulation, object), apart)
     if config.teacher == RGBD:
         hand = hold(hand, object, even, segments.slices(len(even))["manipulate"])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
@@ -11,9 +11,6 @@ from jaxtyping import Float, Float32, UInt8
 from understudy.errors import UnderstudyError, one_of
 from understudy.objects.articulation import Articulation, Handle
 from understudy.trajectories import PlanarTrack, PoseTrack
-
-TASKS: Final = ("room_door", "swivel_door", "drawer", "sliding_door")
-"""The paper's four tasks. A demonstration may also be of another task, with any other name."""
 
 UNKNOWN, FREE, OCCUPIED = 0, 1, 2
 """Values of `OccupancyMap.state`."""

@@ -13,7 +13,7 @@ from understudy.errors import UnderstudyError
 from understudy.objects.articulation import FIXED, Articulation, Handle
 from understudy.objects.fit import fit_articulation
 from understudy.objects.motion import position_of
-from understudy.objects.moving_part.finder import HandHint, find_moving_part
+from understudy.objects.moving_part import HandHint, find_moving_part
 from understudy.trajectories import PoseTrack
 from understudy.types import Person, RegisteredFrame
 

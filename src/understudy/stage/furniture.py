@@ -17,7 +17,7 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float
 
-from understudy.demonstration.demonstration import TASKS
+from understudy.demonstration.tasks import TASKS
 from understudy.errors import UnderstudyError, one_of
 from understudy.geometry import inverse, rigid
 from understudy.objects.articulation import PRISMATIC, REVOLUTE, Articulation, Handle
@@ -72,7 +72,7 @@ class Furniture:
     """One piece of furniture with one moving part."""
 
     task: str
-    """one of demonstration.TASKS"""
+    """one of demonstration.tasks.TASKS"""
     articulation: Articulation
     """world; T_rest is the handle's frame when closed; range is (0, fully open)"""
     handle: Handle

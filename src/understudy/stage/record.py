@@ -14,7 +14,8 @@ from jaxtyping import Float, Float32
 from tqdm import tqdm
 
 from understudy.camera import Camera
-from understudy.demonstration.demonstration import TASKS, Segments
+from understudy.demonstration.demonstration import Segments
+from understudy.demonstration.tasks import TASKS
 from understudy.errors import UnderstudyError, one_of
 from understudy.files import write_atomically
 from understudy.geometry import inverse, transform_points

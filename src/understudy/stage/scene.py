@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
 from scipy.spatial.transform import Rotation
 
-from understudy.demonstration.demonstration import TASKS
+from understudy.demonstration.tasks import TASKS
 from understudy.geometry import inverse
 from understudy.objects.marker_setup import Marker
 from understudy.stage.furniture import Furniture

@@ -69,7 +69,7 @@ class StageTruth:
 
     @property
     def task(self) -> str:
-        """One of demonstration.TASKS."""
+        """One of demonstration.tasks.TASKS."""
         return self.furniture.task
 
 
