@@ -58,7 +58,7 @@ from understudy.teaching_folder import (
 )
 from understudy.teaching_motions import robot_motions, too_short
 from understudy.teaching_stages import Stage, Stages, digest, plain
-from understudy.teaching_trials import TRIAL, Trial, layouts, load_trial, prefer_egl, run_trial
+from understudy.teaching_trials import TRIAL, Trial, layouts, load_trial, run_trial
 
 if TYPE_CHECKING:
     from understudy.actions import RobotMotion, Skill
@@ -151,7 +151,6 @@ class Course:
         self.recordings, self.out, self.task = list(dict.fromkeys(map(str, recordings))), out, task
         self.config = replace(config, demonstration=replace(config.demonstration, task=task))
         self.progress, self.notes = progress, list[str]()
-        prefer_egl()
         self.robot_name, (self.robot, self.platform) = robot, robot_named(robot)
         require_ours(out)
         settings = {"task": task, "robot": robot, "recordings": self.recordings, **plain(self.config)}

@@ -7,9 +7,7 @@ from __future__ import annotations
 
 import io
 import json
-import os
 import shutil
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -66,12 +64,6 @@ class Trial:
         return path if (path := self.folder / SHEET).exists() else None
 
 
-def prefer_egl() -> None:
-    """Lets MuJoCo draw without a display, unless the environment says otherwise: to be called before its import."""
-    if sys.platform == "linux" and "DISPLAY" not in os.environ:
-        os.environ.setdefault("MUJOCO_GL", "egl")
-
-
 def layouts(task: str, count: int, seed: int) -> list[TrialSetup]:
     """`count` layouts of a task that no recording of the stage has."""
     from understudy.execution.trials import setups
@@ -84,8 +76,6 @@ def run_trial(skill: Skill, robot_name: str, setup: TrialSetup, number: int, fol
 
     Raises UnderstudyError when the task is none of the stage's.
     """
-    import mujoco
-
     from understudy.adaptation.robots import platform_of
     from understudy.execution import trials
 
@@ -97,7 +87,7 @@ def run_trial(skill: Skill, robot_name: str, setup: TrialSetup, number: int, fol
         try:
             outcome, note = trials.run_trial(*given, video=folder / VIDEO), ""
             write_atomically(folder / SHEET, _sheet(folder / VIDEO))
-        except (UnderstudyError, MissingExtraError, OSError, mujoco.FatalError) as e:
+        except (UnderstudyError, MissingExtraError, OSError) as e:
             # no OpenGL, no encoder: the trial itself needs neither
             note = f"no video: {e}"
     outcome = outcome or trials.run_trial(*given)

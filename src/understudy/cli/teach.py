@@ -53,9 +53,7 @@ def _teach(arguments: argparse.Namespace) -> int:
         import sklearn  # noqa: F401
 
     from understudy.teaching import TeachConfig, teach
-    from understudy.teaching_trials import prefer_egl
 
-    prefer_egl()
     if not arguments.no_simulation:
         with needs_extra("simulation", "robot"):
             import mujoco  # noqa: F401

@@ -17,14 +17,20 @@ from understudy.stage.render import open_gl
 
 SIZE: Final = (480, 640)
 RATE_HZ: Final = 10.0
+_MOST_GEOMS: Final = 5000
 
 
 class Video:
     """Collects frames of one trial."""
 
     def __init__(self, model: mujoco.MjModel, furniture: Furniture, size: tuple[int, int] = SIZE):
-        open_gl(16, 16).free()  # says what to do where there is no OpenGL
-        self._renderer = mujoco.Renderer(model, *size)
+        height, width = size
+        self._gl = open_gl(width, height)  # not mujoco.Renderer, which needs a display unless MUJOCO_GL was set early
+        self._gl.make_current()
+        self._model = model
+        self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
+        self._scene = mujoco.MjvScene(model, maxgeom=_MOST_GEOMS)
+        self._rect = mujoco.MjrRect(0, 0, width, height)
         self._options = mujoco.MjvOption()
         self._options.geomgroup[:] = 0
         self._options.geomgroup[[0, VISUAL_GROUP]] = 1
@@ -51,12 +57,19 @@ class Video:
 
     def picture(self, data: mujoco.MjData) -> UInt8[np.ndarray, "h w 3"]:
         """Of now."""
-        self._renderer.update_scene(data, self._camera, self._options)
-        return np.asarray(self._renderer.render().copy())
+        self._gl.make_current()
+        everything = mujoco.mjtCatBit.mjCAT_ALL.value
+        mujoco.mjv_updateScene(self._model, data, self._options, None, self._camera, everything, self._scene)
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
+        mujoco.mjr_render(self._rect, self._scene, self._context)
+        image = np.empty((self._rect.height, self._rect.width, 3), np.uint8)
+        mujoco.mjr_readPixels(image, None, self._rect, self._context)
+        return np.ascontiguousarray(image[::-1])
 
     def close(self) -> None:
         """Gives graphics memory back."""
-        self._renderer.close()
+        self._context.free()
+        self._gl.free()
 
 
 def write_video(path: Path, frames: list[UInt8[np.ndarray, "h w 3"]], rate_hz: float = RATE_HZ) -> None:
