@@ -22,9 +22,11 @@ DICTIONARIES: Final = {
 }
 """Names of families of markers, such as 'apriltag_36h11' and '4x4_50', and OpenCV's numbers for them."""
 
-_ENLARGED: Final = 2.0  # images in which nothing was found are looked at again, so much larger
-_NEAR: Final = 2.5  # of a tag's size: where it is looked for again, around where it was
-_NEAR_ENLARGED: Final = 3.0
+_ENLARGED: Final = 2.0  # images in which a marker is missing are looked at again, so much larger ...
+_ENLARGED_EVERY: Final = 5  # ... one frame in so many: it takes five times as long as the rest together
+_NEAR: Final = 2.5  # of a tag's size: where it is looked for first, around where it was
+_NEAR_ENLARGED: Final = 3.0  # at most
+_NEAR_PX: Final = 60  # size of a tag in the image of its surroundings, that small ones are enlarged to
 _LEAST_NEAR_PX: Final = 40
 _REMEMBERED: Final = 10  # frames
 _TURN: Final = 0.35  # radians: between frames, a turn of this size costs as much as one standard deviation
@@ -76,7 +78,10 @@ class MarkerTracker:
         self._patterns: dict[int, np.ndarray] = {}
 
     def detect(self, frame: RegisteredFrame) -> dict[int, MarkerPose]:
-        """Markers by id. One that is seen twice in a frame is left out: nobody knows which is meant."""
+        """Markers by id. One that is seen twice in a frame is left out: nobody knows which is meant.
+
+        With a mapping of sizes, markers that are all found around where they were are not looked for elsewhere.
+        """
         self._frame += 1
         gray = cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY)
         found = self._found(gray)
@@ -92,32 +97,51 @@ class MarkerTracker:
         return not isinstance(self._size, Mapping) or id in self._size
 
     def _found(self, gray: UInt8[np.ndarray, "h w"]) -> dict[int, np.ndarray]:
-        """Corners (pixels) by id; small tags by looking closer."""
-        seen = self._search(gray, (0, 0), 1.0)
-        for id, (pose, when) in self._last.items():
-            if id not in seen and self._frame - when <= _REMEMBERED:
-                middle, side = pose.corners_2d.mean(axis=0), np.ptp(pose.corners_2d, axis=0).max()
-                reach = max(_NEAR * float(side), _LEAST_NEAR_PX)
-                low = np.clip((middle - reach).astype(int), 0, gray.shape[::-1])
-                high = np.clip((middle + reach).astype(int), 0, gray.shape[::-1])
-                if (high - low > 8).all():
-                    part = gray[low[1] : high[1], low[0] : high[0]]
-                    closer = self._search(part, (int(low[0]), int(low[1])), _NEAR_ENLARGED)
-                    seen |= {k: v for k, v in closer.items() if k == id}
-        expected = len(self._size) if isinstance(self._size, Mapping) else 1
-        if len(seen) < expected:
+        """Corners (pixels) by id: first around where they were, then in the whole image, then by looking closer."""
+        recent = [id for id, (_, when) in self._last.items() if self._frame - when <= _REMEMBERED]
+        seen: dict[int, list[np.ndarray]] = {}
+        for id in recent:
+            seen |= self._near(gray, id, _NEAR_PX)
+        if not self._complete(seen) or not isinstance(self._size, Mapping):
+            seen |= self._search(gray, (0, 0), 1.0)
+        for id in recent:
+            if id not in seen:
+                seen |= self._near(gray, id, np.inf)
+        if not self._complete(seen) and self._frame % _ENLARGED_EVERY == 1:
             seen = self._search(gray, (0, 0), _ENLARGED) | seen
         return {id: corners[0] for id, corners in seen.items() if len(corners) == 1}
+
+    def _complete(self, seen: Mapping[int, list[np.ndarray]]) -> bool:
+        """Whether no more markers are expected."""
+        return len(seen) >= (len(self._size) if isinstance(self._size, Mapping) else 1)
+
+    def _near(self, gray: UInt8[np.ndarray, "h w"], id: int, pixels: float) -> dict[int, list[np.ndarray]]:
+        """A marker around where it was last, enlarged to so many pixels if it was smaller."""
+        corners = self._last[id][0].corners_2d
+        middle, side = corners.mean(axis=0), float(np.ptp(corners, axis=0).max())
+        reach = max(_NEAR * side, _LEAST_NEAR_PX)
+        low = np.clip((middle - reach).astype(int), 0, gray.shape[::-1])
+        high = np.clip((middle + reach).astype(int), 0, gray.shape[::-1])
+        if (high - low <= 8).any():
+            return {}
+        part = gray[low[1] : high[1], low[0] : high[0]]
+        scale = float(np.clip(pixels / max(side, 1.0), 1.0, _NEAR_ENLARGED))
+        closer = self._search(part, (int(low[0]), int(low[1])), scale)
+        return {k: v for k, v in closer.items() if k == id}
 
     def _search(
         self, gray: UInt8[np.ndarray, "h w"], origin: tuple[int, int], scale: float
     ) -> dict[int, list[np.ndarray]]:
-        image = gray if scale == 1 else cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
+        image = gray
+        if scale != 1:
+            size = [round(scale * length) for length in gray.shape[::-1]]
+            image = cv2.resize(gray, size, interpolation=cv2.INTER_CUBIC)
+        shrink = np.array(gray.shape[::-1]) / image.shape[::-1]  # 1 / scale, but for whole pixels
         corners, ids, _ = self._detector.detectMarkers(image)
         seen: dict[int, list[np.ndarray]] = {}
         for id, quad in zip([] if ids is None else [int(i) for i in ids.ravel()], corners, strict=True):
             if self._wanted(id):
-                pixels = (quad.reshape(4, 2).astype(np.float64) + 0.5) / scale - 0.5 + origin
+                pixels = (quad.reshape(4, 2).astype(np.float64) + 0.5) * shrink - 0.5 + origin
                 seen.setdefault(id, []).append(pixels)
         return seen
 

@@ -7,11 +7,10 @@ Positions q are nuisance variables, one per pose: they are solved for exactly an
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.spatial.transform import Rotation
 
 from understudy.errors import UnderstudyError
 from understudy.objects.articulation import FIXED, PRISMATIC, REVOLUTE, Articulation
@@ -27,7 +26,7 @@ class Measured:
     """metres"""
     R: Float[np.ndarray, "n 3 3"]
     """identity where the rotation was not measured"""
-    whitener: Float[np.ndarray, "n 6 6"]
+    whitener: Float[np.ndarray, "*b n 6 6"]
     """A with A'A = inverse covariance of (dp, dr); rows of zeros for a rotation that was not measured"""
     oriented: Bool[np.ndarray, " n"]
 
@@ -43,9 +42,9 @@ class Measured:
         """Some of the poses."""
         return Measured(self.p[which], self.R[which], self.whitener[which], self.oriented[which])
 
-    def scaled(self, scale: Float[np.ndarray, "2"]) -> Measured:
-        """With the standard deviations of positions and rotations multiplied."""
-        return Measured(self.p, self.R, self.whitener / np.repeat(scale, 3), self.oriented)
+    def scaled(self, scale: Float[np.ndarray, "*b 2"]) -> Measured:
+        """With the standard deviations of positions and rotations multiplied; for hypotheses each by its own."""
+        return Measured(self.p, self.R, self.whitener / np.repeat(scale, 3, axis=-1)[..., None, None, :], self.oriented)
 
 
 def measured(T: Float[np.ndarray, "n 4 4"], covariance: Float[np.ndarray, "n 6 6"]) -> Measured:
@@ -67,155 +66,185 @@ def measured(T: Float[np.ndarray, "n 4 4"], covariance: Float[np.ndarray, "n 6 6
     return Measured(np.array(T[:, :3, 3], np.float64), R, whitener, oriented)
 
 
-def tangents(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 2"]:
+@dataclass(frozen=True, eq=False)
+class Hypotheses:
+    """Articulations of one kind while they are fitted: one (no leading shape) or many. Nothing is checked."""
+
+    kind: str
+    R: Float[np.ndarray, "*b 3 3"]
+    p: Float[np.ndarray, "*b 3"]
+    """with R the pose at q = 0"""
+    direction: Float[np.ndarray, "*b 3"]
+    point: Float[np.ndarray, "*b 3"]
+
+    @classmethod
+    def of(cls, a: Articulation) -> Hypotheses:
+        """One articulation."""
+        return cls(a.kind, a.T_rest[:3, :3], a.T_rest[:3, 3], a.direction, a.point)
+
+    def part(self, which: Any) -> Hypotheses:
+        """One of many, or some."""
+        return Hypotheses(self.kind, self.R[which], self.p[which], self.direction[which], self.point[which])
+
+    def where(self, mask: Bool[np.ndarray, " b"], other: Hypotheses) -> Hypotheses:
+        """These where the mask is true, others elsewhere."""
+        row = mask[:, None]
+        R, p = np.where(row[..., None], self.R, other.R), np.where(row, self.p, other.p)
+        return Hypotheses(
+            self.kind,
+            R,
+            p,
+            np.where(row, self.direction, other.direction),
+            np.where(row, self.point, other.point),
+        )
+
+
+def tangents(direction: Float[np.ndarray, "*b 3"]) -> Float[np.ndarray, "*b 3 2"]:
     """Two unit vectors across a unit vector, and across each other."""
-    K = _skew(direction[None])[0]
-    first = K[:, np.argmin(np.abs(direction))]  # direction x that axis
-    first = first / np.linalg.norm(first)
-    return np.column_stack([first, K @ first])
+    K = _skew(direction)
+    least = np.abs(direction).argmin(axis=-1)[..., None, None]
+    first = np.take_along_axis(K, least, axis=-1)  # direction x that axis
+    first = first / np.sqrt((first**2).sum(axis=-2, keepdims=True))
+    return np.concatenate([first, K @ first], axis=-1)
 
 
-def residuals(articulation: Articulation, q: Float[np.ndarray, " n"], m: Measured) -> Float[np.ndarray, "n 6"]:
-    """(dp, dr) that take the articulation's poses to the measured ones; dr is 0 where no rotation was measured."""
-    E = _turns(articulation, q)
-    R, p = E @ articulation.T_rest[:3, :3], _origins(articulation, q, E)
-    dr = _log(m.R @ R.transpose(0, 2, 1))
-    return np.hstack([m.p - p, dr * m.oriented[:, None]])
+def residuals(h: Hypotheses, q: Float[np.ndarray, "*b n"], m: Measured) -> Float[np.ndarray, "*b n 6"]:
+    """(dp, dr) that take the articulations' poses to the measured ones; dr is 0 where no rotation was measured."""
+    E = _turns(h, q)
+    dr = _log(m.R @ (E @ h.R[..., None, :, :]).swapaxes(-1, -2))
+    return np.concatenate([m.p - _origins(h, q, E), dr * m.oriented[:, None]], axis=-1)
 
 
-def _turns(articulation: Articulation, q: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 3 3"]:
-    """Rotations from the rest pose, by Rodrigues' formula: the axis is one for all."""
-    if articulation.kind != REVOLUTE:
-        return np.broadcast_to(np.eye(3), (len(q), 3, 3))
-    K = _skew(articulation.direction[None])[0]
-    return np.asarray(np.eye(3) + np.sin(q)[:, None, None] * K + (1 - np.cos(q))[:, None, None] * (K @ K))
+def _turns(h: Hypotheses, q: np.ndarray) -> np.ndarray:
+    """Rotations (*b, n, 3, 3) from the rest pose, by Rodrigues' formula: the axis is one for all."""
+    if h.kind != REVOLUTE:
+        return np.broadcast_to(np.eye(3), (*q.shape, 3, 3))
+    K = _skew(h.direction)[..., None, :, :]
+    return np.asarray(np.eye(3) + np.sin(q)[..., None, None] * K + (1 - np.cos(q))[..., None, None] * (K @ K))
 
 
-def _origins(
-    articulation: Articulation, q: Float[np.ndarray, " n"], E: Float[np.ndarray, "n 3 3"]
-) -> Float[np.ndarray, "n 3"]:
-    """Where the part's origin goes."""
-    rest = articulation.T_rest[:3, 3]
-    if articulation.kind == REVOLUTE:
-        return np.asarray(E @ (rest - articulation.point) + articulation.point)
-    return rest + (q[:, None] * articulation.direction if articulation.kind == PRISMATIC else np.zeros((len(q), 1)))
+def _origins(h: Hypotheses, q: np.ndarray, E: np.ndarray) -> np.ndarray:
+    """Where the part's origin goes, (*b, n, 3)."""
+    if h.kind == REVOLUTE:
+        arm = (h.p - h.point)[..., None, :, None]
+        return np.asarray((E @ arm)[..., 0] + h.point[..., None, :])
+    way = q[..., None] * h.direction[..., None, :] if h.kind == PRISMATIC else np.zeros((*q.shape, 3))
+    return h.p[..., None, :] + way
 
 
-def _log(R: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "n 3"]:
-    """Rotation vectors. Less exact within 1e-6 of half a turn, where only outliers are; half of scipy's time."""
-    v = np.stack([R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], axis=1) / 2
-    sine = np.sqrt((v**2).sum(axis=1))
-    angle = np.arctan2(sine, (R[:, 0, 0] + R[:, 1, 1] + R[:, 2, 2] - 1) / 2)
+def _log(R: np.ndarray) -> np.ndarray:
+    """Rotation vectors (*b, 3). Less exact within 1e-6 of half a turn, where only outliers are."""
+    v = np.stack([R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], axis=-1) / 2
+    sine = np.sqrt((v**2).sum(axis=-1))
+    angle = np.arctan2(sine, (R[..., 0, 0] + R[..., 1, 1] + R[..., 2, 2] - 1) / 2)
     factor = np.where(sine > 1e-12, angle / np.maximum(sine, 1e-12), 1.0)
-    return np.asarray(v * factor[:, None])
+    return np.asarray(v * factor[..., None])
 
 
-def whiten(m: Measured, e: Float[np.ndarray, "n 6 *k"]) -> Float[np.ndarray, "n 6 *k"]:
-    """Residuals or their derivatives in standard deviations."""
-    return np.asarray((m.whitener @ e.reshape(len(e), 6, -1)).reshape(e.shape))
+def _exp(v: np.ndarray) -> np.ndarray:
+    """Rotations (*b, 3, 3) of rotation vectors (*b, 3)."""
+    angle = np.sqrt((v**2).sum(axis=-1))[..., None, None]
+    K = _skew(v)
+    return np.asarray(np.eye(3) + np.sinc(angle / np.pi) * K + np.sinc(angle / (2 * np.pi)) ** 2 / 2 * (K @ K))
 
 
-def slope(articulation: Articulation, q: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 6"]:
+def whiten(m: Measured, e: Float[np.ndarray, "*b n 6"]) -> Float[np.ndarray, "*b n 6"]:
+    """Residuals in standard deviations."""
+    return np.asarray((m.whitener @ e[..., None])[..., 0])
+
+
+def slope(h: Hypotheses, q: Float[np.ndarray, "*b n"]) -> Float[np.ndarray, "*b n 6"]:
     """Velocity (metres, and radians as a rotation vector) of the part's pose per unit of q."""
-    out = np.zeros((len(q), 6))
-    if articulation.kind == PRISMATIC:
-        out[:, :3] = articulation.direction
-    elif articulation.kind == REVOLUTE:
-        arm = _origins(articulation, q, _turns(articulation, q)) - articulation.point
-        out[:, :3] = arm @ _skew(articulation.direction[None])[0].T
-        out[:, 3:] = articulation.direction
+    out = np.zeros((*q.shape, 6))
+    if h.kind == PRISMATIC:
+        out[..., :3] = h.direction[..., None, :]
+    elif h.kind == REVOLUTE:
+        arm = _origins(h, q, _turns(h, q)) - h.point[..., None, :]
+        out[..., :3] = arm @ _skew(h.direction).swapaxes(-1, -2)
+        out[..., 3:] = h.direction[..., None, :]
     return out
 
 
 def derivatives(
-    articulation: Articulation, q: Float[np.ndarray, " n"], e: Float[np.ndarray, "n 6"]
-) -> Float[np.ndarray, "n 6 k"]:
+    h: Hypotheses, q: Float[np.ndarray, "*b n"], e: Float[np.ndarray, "*b n 6"]
+) -> Float[np.ndarray, "*b n 6 k"]:
     """Of the residuals e by the unknowns that `stepped` takes."""
-    n = len(q)
-    motion = np.zeros((n, 6, {FIXED: 6, PRISMATIC: 8, REVOLUTE: 10}[articulation.kind]))
-    B = tangents(articulation.direction)
-    if articulation.kind == REVOLUTE:
-        E = _turns(articulation, q)
-        motion[:, :3, :3] = motion[:, 3:, 3:6] = E
-        tilt = (np.eye(3) - E) @ B
-        arm = _origins(articulation, q, E) - articulation.point
-        motion[:, :3, 6:8] = -_skew(arm) @ tilt
-        motion[:, 3:, 6:8] = tilt
-        motion[:, :3, 8:10] = tilt
+    motion = np.zeros((*q.shape, 6, {FIXED: 6, PRISMATIC: 8, REVOLUTE: 10}[h.kind]))
+    if h.kind == REVOLUTE:
+        E = _turns(h, q)
+        motion[..., :3, :3] = motion[..., 3:, 3:6] = E
+        tilt = (np.eye(3) - E) @ tangents(h.direction)[..., None, :, :]
+        arm = _origins(h, q, E) - h.point[..., None, :]
+        motion[..., :3, 6:8] = -_skew(arm) @ tilt
+        motion[..., 3:, 6:8] = motion[..., :3, 8:10] = tilt
     else:
-        motion[:, :6, :6] = np.eye(6)
-        if articulation.kind == PRISMATIC:
-            motion[:, :3, 6:8] = -q[:, None, None] * _skew(articulation.direction[None]) @ B
-    return -_seen(motion, e)
+        motion[..., :6] = np.eye(6)
+        if h.kind == PRISMATIC:
+            way = _skew(h.direction) @ tangents(h.direction)
+            motion[..., :3, 6:8] = -q[..., None, None] * way[..., None, :, :]
+    motion[..., 3:, :] = _seen(e) @ motion[..., 3:, :]
+    return -motion
 
 
-def _seen(motion: Float[np.ndarray, "n 6 *k"], e: Float[np.ndarray, "n 6"]) -> Float[np.ndarray, "n 6 *k"]:
+def _seen(e: np.ndarray) -> np.ndarray:
     """The change of Log(R_measured R') when R turns by a small rotation on its left: the inverse right Jacobian."""
-    phi = e[:, 3:]
-    angle = np.clip(np.linalg.norm(phi, axis=1), 1e-3, 3.0)  # below: the series' next term is 1e-9; above: an outlier
-    K = _skew(phi)
+    angle = np.sqrt((e[..., 3:] ** 2).sum(axis=-1))
+    angle = np.clip(angle, 1e-3, 3.0)  # below: the series' next term is 1e-9; above: an outlier
+    K = _skew(e[..., 3:])
     factor = 1 / angle**2 - (1 + np.cos(angle)) / (2 * angle * np.sin(angle))
-    inverse = np.eye(3) + K / 2 + factor[:, None, None] * (K @ K)
-    out = motion.copy()
-    out[:, 3:] = (inverse @ motion[:, 3:].reshape(len(e), 3, -1)).reshape(motion[:, 3:].shape)
-    return out
+    return np.asarray(np.eye(3) + K / 2 + factor[..., None, None] * (K @ K))
 
 
-def _skew(v: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3 3"]:
-    x, y, z = v.T
-    o = np.zeros_like(x)
-    return np.stack([o, -z, y, z, o, -x, -y, x, o], axis=1).reshape(-1, 3, 3)
+def _skew(v: np.ndarray) -> np.ndarray:
+    K = np.zeros((*v.shape, 3))
+    K[..., 2, 1], K[..., 0, 2], K[..., 1, 0] = v[..., 0], v[..., 1], v[..., 2]
+    return K - K.swapaxes(-1, -2)
 
 
-def stepped(articulation: Articulation, delta: Float[np.ndarray, " k"]) -> Articulation:
-    """Moved a little: T_rest by (dp, dr) on its left, the direction by a rotation across it, the point across it."""
-    T = articulation.T_rest.copy()
-    T[:3, 3] += delta[:3]
-    T[:3, :3] = (Rotation.from_rotvec(delta[3:6]) * Rotation.from_matrix(T[:3, :3])).as_matrix()
-    direction, point = articulation.direction, articulation.point
-    if articulation.kind != FIXED:
+def stepped(h: Hypotheses, delta: np.ndarray) -> Hypotheses:
+    """Moved a little: the pose by (dp, dr) on its left, the direction by a rotation across it, the point across it."""
+    direction, point = h.direction, h.point
+    if h.kind != FIXED:
         B = tangents(direction)
-        direction = Rotation.from_rotvec(B @ delta[6:8]).apply(direction)
-        direction = direction / np.linalg.norm(direction)
-        if articulation.kind == REVOLUTE:
-            point = point + B @ delta[8:10]
-    return Articulation(articulation.kind, T, direction, point, articulation.range)
+        turn = _exp((B @ delta[..., 6:8, None])[..., 0])
+        direction = (turn @ direction[..., None])[..., 0]
+        if h.kind == REVOLUTE:
+            point = point + (B @ delta[..., 8:10, None])[..., 0]
+    return Hypotheses(h.kind, _exp(delta[..., 3:6]) @ h.R, h.p + delta[..., :3], direction, point)
 
 
 def solve_positions(
-    articulation: Articulation, m: Measured, start: Float[np.ndarray, " n"] | None = None, steps: int = _STEPS
-) -> Float[np.ndarray, " n"]:
+    h: Hypotheses, m: Measured, start: Float[np.ndarray, "*b n"] | None = None, steps: int = _STEPS
+) -> Float[np.ndarray, "*b n"]:
     """The likeliest q of each pose; angles in (-pi, pi], or near `start` where that is given."""
-    if articulation.kind == FIXED:
-        return np.zeros(len(m))
-    q = start
-    if q is None or articulation.kind == PRISMATIC:
-        q = np.zeros(len(m)) if articulation.kind == PRISMATIC else _first_angles(articulation, m)
-    for _ in range(1 if articulation.kind == PRISMATIC else steps):
-        e = residuals(articulation, q, m)
-        j = whiten(m, _seen(slope(articulation, q), e))
-        r = whiten(m, e)
-        step = (j * r).sum(axis=1) / np.maximum((j**2).sum(axis=1), 1e-12)
-        q = q + (step if articulation.kind == PRISMATIC else np.clip(step, -0.5, 0.5))
-    return q if start is not None or articulation.kind == PRISMATIC else np.pi - (np.pi - q) % (2 * np.pi)
+    q = np.zeros((*h.p.shape[:-1], len(m))) if start is None else start
+    if h.kind == FIXED:
+        return q
+    if h.kind == REVOLUTE and start is None:
+        q = _first_angles(h, m)
+    for _ in range(1 if h.kind == PRISMATIC else steps):
+        e = residuals(h, q, m)
+        j = slope(h, q)
+        j[..., 3:] = (_seen(e) @ j[..., 3:, None])[..., 0]
+        j, r = whiten(m, j), whiten(m, e)
+        step = (j * r).sum(axis=-1) / np.maximum((j**2).sum(axis=-1), 1e-12)
+        q = q + (step if h.kind == PRISMATIC else np.clip(step, -0.5, 0.5))
+    return q if start is not None or h.kind == PRISMATIC else np.pi - (np.pi - q) % (2 * np.pi)
 
 
-def _first_angles(articulation: Articulation, m: Measured) -> Float[np.ndarray, " n"]:
+def _first_angles(h: Hypotheses, m: Measured) -> np.ndarray:
     """Angles from positions and from rotations, averaged on the circle with about the weights they deserve."""
-    a = articulation.direction
-    arm, rest = m.p - articulation.point, articulation.T_rest[:3, 3] - articulation.point
-    rest = rest - a * (rest @ a)
-    cos, sin = arm @ rest, np.cross(rest, arm) @ a
+    across = tangents(h.direction)
+    arm, rest = (m.p - h.point[..., None, :]) @ across, (h.p - h.point)[..., None, :] @ across
+    cos = (arm * rest).sum(axis=-1)
+    sin = arm[..., 1] * rest[..., 0] - arm[..., 0] * rest[..., 1]
     length = np.maximum(np.hypot(cos, sin), 1e-12)
-    weight = (rest @ rest) * (m.whitener[:, :3, :3] ** 2).sum(axis=(1, 2)) / 3
-    turn = m.R @ articulation.T_rest[:3, :3].T  # its twist about a: from the trace and the skew part across a
-    swung = turn @ tangents(a)
-    across = tangents(a)
-    angle = np.arctan2(
-        (swung[:, :, 0] @ across[:, 1]) - (swung[:, :, 1] @ across[:, 0]),
-        (swung[:, :, 0] @ across[:, 0]) + (swung[:, :, 1] @ across[:, 1]),
-    )
-    weight_r = (m.whitener[:, 3:, 3:] ** 2).sum(axis=(1, 2)) / 3
+    precision = (m.whitener**2).sum(axis=-2) / 3
+    weight = (rest**2).sum(axis=-1) * precision[..., :3].sum(axis=-1)
+    turn = m.R @ h.R[..., None, :, :].swapaxes(-1, -2)
+    twist = across[..., None, :, :].swapaxes(-1, -2) @ turn @ across[..., None, :, :]
+    angle = np.arctan2(twist[..., 1, 0] - twist[..., 0, 1], twist[..., 0, 0] + twist[..., 1, 1])
+    weight_r = precision[..., 3:].sum(axis=-1)
     x = weight * cos / length + weight_r * np.cos(angle)
     y = weight * sin / length + weight_r * np.sin(angle)
     return np.asarray(np.arctan2(y, x))
@@ -233,9 +262,9 @@ def position_of(
     known = np.isfinite(T[:, :3, 3]).all(axis=1)
     q, sigma = np.full((2, len(T)), np.nan)
     if known.any():
-        m = measured(T[known], covariance[known])
-        q[known] = solve_positions(articulation, m)
-        j = whiten(m, slope(articulation, q[known]))
+        m, h = measured(T[known], covariance[known]), Hypotheses.of(articulation)
+        q[known] = solve_positions(h, m)
+        j = whiten(m, slope(h, q[known]))
         with np.errstate(divide="ignore"):
             sigma[known] = 0.0 if articulation.kind == FIXED else 1 / np.linalg.norm(j, axis=1)
     return q, sigma

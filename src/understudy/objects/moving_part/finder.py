@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -12,11 +12,14 @@ from scipy.ndimage import minimum_filter1d
 
 from understudy.errors import UnderstudyError
 from understudy.geometry import inverse, is_rigid, transform_points
-from understudy.objects.articulation import FIXED, PRISMATIC, REVOLUTE, Articulation, Handle
+from understudy.objects.articulation import REVOLUTE, Articulation, Handle
 from understudy.objects.moving_part.handle import find_handle
+from understudy.objects.moving_part.hinge import fit_hinge
 from understudy.objects.moving_part.motion import Motion, refine, sharpen, spread_frames, track
+from understudy.objects.moving_part.outcome import at_handle, at_rest, pose_track, reversed_
+from understudy.objects.moving_part.part import HandHint, MovingPart, MovingPartConfig
 from understudy.objects.moving_part.region import Region, grow
-from understudy.objects.moving_part.scoring import PartModel, Scorer, motions
+from understudy.objects.moving_part.scoring import PartModel, Scorer, in_part, motions
 from understudy.objects.moving_part.search import (
     HandPath,
     Hypothesis,
@@ -28,74 +31,20 @@ from understudy.objects.moving_part.search import (
     step_m,
     try_panel,
 )
-from understudy.objects.moving_part.stack import DepthStack, Frames, Reference, changed, reference
-from understudy.trajectories import PoseTrack
+from understudy.objects.moving_part.stack import DepthStack, Frames, Reference, changed, left, reference
 from understudy.types import Person
 
 _FAMILY: Final = {"out": 1.0, "level": 1.0, "hinge": 1.0, "flap": 0.7, "lift": 0.7}  # how common they are
-_HAND_SPREAD: Final = 0.06  # metres by which the hand may wander on the handle
-
-
-@dataclass(frozen=True, eq=False)
-class HandHint:
-    """Where the acting hand was, as the skeleton tells. World frame."""
-
-    times_s: Float[np.ndarray, " t"]
-    positions: Float[np.ndarray, "t 3"]
-    """mid-palm, metres; NaN where missing; errors of 5 cm are usual, of 12 cm happen"""
-    sigma_m: Float[np.ndarray, " t"]
-    """one sigma of the position; NaN where missing"""
-
-    def __post_init__(self) -> None:
-        t = len(self.times_s)
-        if self.positions.shape != (t, 3) or self.sigma_m.shape != (t,):
-            raise UnderstudyError(
-                f"hand hint: {t} times need positions ({t}, 3) and sigma_m ({t},), "
-                f"got {self.positions.shape}, {self.sigma_m.shape}"
-            )
-        if t < 2 or not (np.diff(self.times_s) > 0).all():
-            raise UnderstudyError("hand hint: times_s must be 2 or more and increase")
-
-
-@dataclass(frozen=True)
-class MovingPartConfig:
-    """Settings of `find_moving_part`."""
-
-    search_frames: int = 14
-    """frames on which hypotheses are tried"""
-    tried: int = 6
-    """hypotheses that are tracked through the recording"""
-    refined: int = 2
-    """hypotheses that are refined"""
-    points: int = 500
-    """of the part, for its final track"""
-    least_way_m: float = 0.03
-    """of the handle: what moves less did not move"""
-    least_moving_s: float = 0.4
-    """nothing is opened in less time"""
-    least_evidence_m2: float = 0.002
-    """area that the motion must explain better than rest does"""
-
-
-@dataclass(frozen=True, eq=False)
-class MovingPart:
-    """What moved, and how."""
-
-    track: PoseTrack
-    """of the handle's frame, world"""
-    articulation: Articulation
-    """world; T_rest is the handle's frame at rest"""
-    handle: Handle
-    q: Float[np.ndarray, " t"]
-    """radians or metres; filled in where `track` says not observed"""
-    sigma_q: Float[np.ndarray, " t"]
-    moving: tuple[int, int]
-    """first and last sample of the motion; (0, 0) if nothing moves"""
-    part_points: Float[np.ndarray, "n 3"]
-    """visible points of the part before the motion, in the handle's frame, metres"""
-    quality: dict[str, float] = field(default_factory=dict)
-    """agreement (mean over observed frames: 1 = every point is where it should be), evidence_m2, runner_up_m2 (of the
-    best hypothesis of another kind of motion), hand_spread_m, handle_seen"""
+_TRUST_LATER, _TRUST_LAST = (
+    0.3,
+    0.1,
+)  # in the hand, the better part and articulation are known: hidden hands are far off
+_WIDEST: Final = 1.3  # metres: radius of a hinge; no door leaf is wider
+_POLISHED: Final = 2  # times that a hinge is fitted to the last track
+_AGREES: Final = 0.2  # of a frame that may tell where a hinge is
+_SURE: Final = 0.1  # metres: sigma of a hand that may tell where on the part it is
+_WORSE: Final = 0.95  # of the best merit: what a refinement may lose
+_HAND_SPREAD: Final = 0.1  # metres by which the hand may wander on the handle
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,7 +104,11 @@ class _Finder:
         refined = sorted(map(self._refined, tracked[: self.config.refined]), key=lambda t: -t.merit)
         if not refined or refined[0].merit < self.config.least_evidence_m2:
             return self._still()
-        best = self._refined(refined[0], (0.008,))
+        worth = [t for t in refined if t.merit >= self.config.least_evidence_m2]
+        last = (self._polished(self._refined(t, (0.008,))) for t in worth)
+        best = next((t for t in last if t.articulation.radius_m < _WIDEST), None)
+        if best is None:
+            return self._still()
         others = [t.merit for t in (*refined, *tracked) if t.hypothesis.family != best.hypothesis.family]
         return self._result(best, max(others, default=0.0))
 
@@ -195,9 +148,11 @@ class _Finder:
 
     # --- one hypothesis ---
 
-    def _follow(self, model: PartModel, articulation: Articulation, points: int, sigma_m: float) -> Motion:
+    def _follow(
+        self, model: PartModel, articulation: Articulation, points: int, sigma_m: float, trust: float = 1.0
+    ) -> Motion:
         thin = model.thinned(points, self.rng)
-        return track(self.scorer, thin, articulation, self.hand, self.times_s, int(self.grasps[0]), sigma_m)
+        return track(self.scorer, thin, articulation, self.hand, self.times_s, int(self.grasps[0]), sigma_m, trust)
 
     def _grow(self, model: PartModel, articulation: Articulation, motion: Motion) -> Region | None:
         picked = spread_frames(motion.q, self._trusted(articulation, motion), 14)
@@ -220,25 +175,52 @@ class _Finder:
         lasts = float(moving.sum() * np.median(np.diff(self.times_s)))
         spread = 1.0
         if lasts >= self.config.least_moving_s and moving.sum() >= 3:
-            held = _in_part(articulation, motion.q[moving], self.hand.positions[moving])
+            held = self._held(articulation, motion.q, moving)
             spread = float(np.sqrt(np.median(((held - np.median(held, axis=0)) ** 2).sum(1))))
         way = float(np.ptp(motion.q)) * step_m(articulation)
-        trust = np.exp(-0.5 * (spread / _HAND_SPREAD) ** 2) * _FAMILY[h.family] * (way > self.config.least_way_m)
+        possible = articulation.radius_m < _WIDEST  # beyond, it is a drawer that is not quite straight
+        trust = 1 / (1 + (spread / _HAND_SPREAD) ** 2) * _FAMILY[h.family] * (way > self.config.least_way_m) * possible
         merit = region.evidence_m2 * float(trust)
         return _Tracked(h, articulation, region.model, motion, region.evidence_m2, spread, merit)
 
     def _refined(self, t: _Tracked, sigmas_m: tuple[float, ...] = (0.015, 0.008)) -> _Tracked:
+        best = t
         for sigma_m in sigmas_m:
-            picked = spread_frames(t.motion.q, self._trusted(t.articulation, t.motion), 12)
-            thin = t.model.thinned(220, self.rng)
-            articulation, thickness = refine(self.scorer, thin, t.articulation, t.motion.q, picked, sigma_m)
+            articulation, thickness = self._fit(t, sigma_m)
             model = replace(t.model, thickness_m=thickness)
-            motion = self._follow(model, articulation, 160, 1.2 * sigma_m)
+            motion = self._follow(model, articulation, 160, 1.2 * sigma_m, 1.0 if sigma_m > 0.01 else _TRUST_LATER)
             region = self._grow(model, articulation, motion)
             if region is None:
-                return t
+                break
             t = self._judged(t.hypothesis, articulation, region, motion)
+            best = t if t.merit > _WORSE * best.merit else best
+        return best
+
+    def _polished(self, t: _Tracked) -> _Tracked:
+        """With a last track that hardly cares about the hand; a hinge is fitted to it again."""
+        t = replace(t, motion=self._follow(t.model, t.articulation, 200, 0.01, _TRUST_LAST))
+        for _ in range(_POLISHED if t.articulation.kind == REVOLUTE else 0):
+            t = replace(t, articulation=self._fit(t, 0.008)[0])
+            t = replace(t, motion=self._follow(t.model, t.articulation, 200, 0.01, _TRUST_LAST))
         return t
+
+    def _held(self, articulation: Articulation, q: np.ndarray, moving: np.ndarray) -> Float[np.ndarray, "n 3"]:
+        """Where the hand is on the part while it moves (world, at rest)."""
+        index = np.flatnonzero(moving)
+        sure = index[self.hand.sigma_m[index] < _SURE]
+        index = sure if len(sure) >= 3 else index
+        return in_part(articulation, q[index], self.hand.positions[index])
+
+    def _fit(self, t: _Tracked, sigma_m: float) -> tuple[Articulation, float]:
+        """Articulation, and thickness of the front, from some frames."""
+        trusted = self._trusted(t.articulation, t.motion)
+        thin = t.model.thinned(220, self.rng)
+        if t.articulation.kind == REVOLUTE and t.model.flat.sum() > 40:
+            good = trusted & (t.motion.agreement > _AGREES)
+            picked = spread_frames(t.motion.q, good if good.sum() > 5 else trusted, 24)
+            return fit_hinge(self.scorer, thin, t.articulation, t.motion.q[picked], picked, sigma_m)
+        picked = spread_frames(t.motion.q, trusted, 12)
+        return refine(self.scorer, thin, t.articulation, t.motion.q, picked, sigma_m)
 
     # --- result ---
 
@@ -248,21 +230,23 @@ class _Finder:
         assert motion.curvature is not None
         way = np.abs(q) * step_m(t.articulation)
         observed = self.stack.usable & (motion.agreement > 0.1) & (motion.curvature > 0)
-        moving = np.flatnonzero(np.abs(np.gradient(t.motion.q)) * step_m(t.articulation) > 0.003)
-        first, last = (int(moving[0]), int(moving[-1])) if len(moving) else (0, 0)
+        moving = np.abs(np.gradient(t.motion.q)) * step_m(t.articulation) > 0.003
+        first, last = (int(i) for i in np.flatnonzero(moving)[[0, -1]]) if moving.any() else (0, 0)
         if way.max() < self.config.least_way_m:
             return self._still()
-        grip = np.median(_in_part(t.articulation, q[moving], self.hand.positions[moving]), axis=0)
+        grip = np.median(self._held(t.articulation, q, moving), axis=0)
         front = float(t.model.points[t.model.flat].mean(0) @ t.model.normal)
-        T_rest, handle, seen = self._handle(self.ref, np.eye(4), t.model.normal, front, grip)
+        gone = left(self.stack, self.ref, np.flatnonzero(self.stack.usable & (way > 0.5 * way.max())))
+        T_rest, handle, seen = self._handle(self.ref, np.eye(4), t.model.normal, front, grip, gone)
         if not seen and last < len(q) - 3:  # somebody stood before it: look again where it came to rest
             after = reference(self.stack, np.arange(last + 1, len(q)), self.T_world_cam)
             moved = motions(t.articulation, q[-1:])[0]
-            again = self._handle(after, moved, t.model.normal, front, grip)
+            came = left(self.stack, after, np.flatnonzero(self.stack.usable & (way < 0.05)))
+            again = self._handle(after, moved, t.model.normal, front, grip, came)
             T_rest, handle, seen = again if again[2] else (T_rest, handle, seen)
-        articulation = _at_handle(t.articulation, T_rest, q)
+        articulation = at_handle(t.articulation, T_rest, q)
         if np.median(q[last:]) < 0:
-            articulation, q = _reversed(articulation), -q
+            articulation, q = reversed_(articulation), -q
         articulation = replace(articulation, range=(float(q.min()), float(q.max())))
         reach = step_m(articulation)
         sigma_m = np.where(observed, 0.003 + 0.05 / np.sqrt(np.maximum(motion.curvature, 25.0)), 0.05)
@@ -273,12 +257,18 @@ class _Finder:
             "hand_spread_m": t.hand_spread_m,
             "handle_seen": float(seen),
         }
-        track = _pose_track(articulation, q, sigma_m / reach, observed, handle_sigma_m=0.01 if seen else 0.04)
+        track = pose_track(articulation, q, sigma_m / reach, observed, handle_sigma_m=0.01 if seen else 0.04)
         points = transform_points(inverse(T_rest), t.model.points)
         return MovingPart(track, articulation, handle, q, sigma_m / reach, (first, last), points, quality)
 
     def _handle(
-        self, ref: Reference, moved: np.ndarray, normal: np.ndarray, front: float, hand: np.ndarray
+        self,
+        ref: Reference,
+        moved: np.ndarray,
+        normal: np.ndarray,
+        front: float,
+        hand: np.ndarray,
+        free: Bool[np.ndarray, "h w"],
     ) -> tuple[np.ndarray, Handle, bool]:
         """T_world_handle at rest, looked for where `moved` takes the part: normal, front and hand are those at rest."""
         at = transform_points(moved, hand)
@@ -286,7 +276,7 @@ class _Finder:
         ray = at - self.T_world_cam[:3, 3]
         pixel_m = float(ray @ self.T_world_cam[:3, 2]) / self.stack.camera.fx
         offset = float(n @ transform_points(moved, normal * front))
-        T, handle, seen = find_handle(ref, n, offset, at, ray / np.linalg.norm(ray), pixel_m)
+        T, handle, seen = find_handle(ref, n, offset, at, ray / np.linalg.norm(ray), pixel_m, free)
         return inverse(moved) @ T, handle, seen
 
     def _still(self) -> MovingPart:
@@ -303,57 +293,8 @@ class _Finder:
         panel = panels[len(panels) // 2]
         normal = panel.model.normal
         front = float(panel.model.points[panel.model.flat].mean(0) @ normal)
-        T_rest, handle, seen = self._handle(self.ref, np.eye(4), normal, front, panel.T_world_panel[:3, 3])
-        t = len(self.stack)
-        articulation = Articulation(FIXED, T_rest, normal, T_rest[:3, 3], (0.0, 0.0))
-        track = _pose_track(
-            articulation, np.zeros(t), np.zeros(t), self.stack.usable.copy(), handle_sigma_m=0.01 if seen else 0.05
+        T_rest, handle, seen = self._handle(
+            self.ref, np.eye(4), normal, front, panel.T_world_panel[:3, 3], self.ref.z > 0
         )
         points = transform_points(inverse(T_rest), panel.model.points)
-        quality = {"agreement": 0.0, "evidence_m2": 0.0, "runner_up_m2": 0.0, "hand_spread_m": 0.0}
-        return MovingPart(
-            track,
-            articulation,
-            handle,
-            np.zeros(t),
-            np.zeros(t),
-            (0, 0),
-            points,
-            quality | {"handle_seen": float(seen)},
-        )
-
-
-def _in_part(articulation: Articulation, q: np.ndarray, positions: np.ndarray) -> Float[np.ndarray, "n 3"]:
-    """Points that are on the part at q, brought back to where they are at rest (world)."""
-    T = np.linalg.inv(motions(articulation, q))
-    return np.asarray(np.einsum("nij,nj->ni", T[:, :3, :3], positions) + T[:, :3, 3])
-
-
-def _at_handle(a: Articulation, T_rest: np.ndarray, q: np.ndarray) -> Articulation:
-    """The same motion of the handle's frame."""
-    origin = T_rest[:3, 3]
-    point = origin if a.kind == PRISMATIC else a.point + a.direction * ((origin - a.point) @ a.direction)
-    return Articulation(a.kind, T_rest, a.direction, point, (float(q.min()), float(q.max())))
-
-
-def _reversed(a: Articulation) -> Articulation:
-    return replace(a, direction=-a.direction, range=(-a.range[1], -a.range[0]))
-
-
-def _pose_track(
-    a: Articulation, q: np.ndarray, sigma_q: np.ndarray, observed: np.ndarray, handle_sigma_m: float
-) -> PoseTrack:
-    """Poses on the articulation; covariance from q along the motion, and of where the handle is on the part."""
-    t = len(q)
-    covariance = np.zeros((t, 6, 6))
-    covariance[:, :3, :3] = np.eye(3) * (handle_sigma_m**2 + 0.003**2)
-    covariance[:, 3:, 3:] = np.eye(3) * np.radians(1.0) ** 2
-    T = a.pose(q)
-    tangent = np.zeros((t, 6))
-    if a.kind == PRISMATIC:
-        tangent[:, :3] = a.direction
-    elif a.kind == REVOLUTE:
-        tangent[:, :3] = np.cross(a.direction, T[:, :3, 3] - a.point)
-        tangent[:, 3:] = a.direction
-    covariance += sigma_q[:, None, None] ** 2 * tangent[:, :, None] * tangent[:, None, :]
-    return PoseTrack(T, covariance, observed, observed.copy())
+        return at_rest(T_rest, handle, seen, points, self.stack.usable)

@@ -6,7 +6,7 @@ from typing import Final
 
 import cv2
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from understudy.geometry import rigid
 from understudy.objects.articulation import Handle
@@ -15,6 +15,7 @@ from understudy.objects.moving_part.stack import Reference
 _NEAR: Final = 0.25  # metres between the hand's middle place and the handle's
 _OUT: Final = (0.012, 0.13)  # metres in front of the panel
 _LONG: Final = 1.4  # times as long as wide: a bar with a direction
+_KNOB: Final = 0.06  # metres: what is shorter has no direction that one could see, and counts as level
 _LEVEL: Final = 0.5  # vertical component of a bar's direction up to which it counts as level
 _STRAIGHT: Final = float(np.cos(np.radians(35)))
 _LEAST: Final = 4  # pixels
@@ -28,15 +29,17 @@ def find_handle(
     hand: Float[np.ndarray, "3"],
     ray: Float[np.ndarray, "3"],
     pixel_m: float,
+    moved: Bool[np.ndarray, "h w"],
 ) -> tuple[Float[np.ndarray, "4 4"], Handle, bool]:
     """T_world_handle at rest, the handle, and whether it was seen (else it is put where the hand was).
 
     normal, front: the panel is n . p = front (world, metres). hand: where the hand was, brought back to rest. ray: from
-    the camera to it (unit). pixel_m: size of a pixel there.
+    the camera to it (unit). pixel_m: size of a pixel there. moved: pixels whose surface does
+    not stay when the part goes.
     """
     grip = hand - _PALM * normal
     height = ref.points @ normal - front
-    near = (ref.z > 0) & (height > _OUT[0]) & (height < _OUT[1])
+    near = moved & (ref.z > 0) & (height > _OUT[0]) & (height < _OUT[1])
     near &= np.linalg.norm(ref.points - grip, axis=-1) < _NEAR
     piece = _piece(near, ref.points, grip)
     up = np.array([0, 0, 1.0]) - normal * normal[2]
@@ -85,10 +88,10 @@ def _bar(points: np.ndarray, normal: np.ndarray, up: np.ndarray) -> tuple[np.nda
     flat = np.column_stack([(points - center) @ side, (points - center) @ up])
     if len(flat) > 5:
         values, vectors = np.linalg.eigh(np.cov(flat.T))
-        elongated = values[1] > _LONG**2 * max(values[0], 1e-8)
-        main = vectors[:, 1] if elongated else np.array([0.0, 1.0])
+        elongated = values[1] > max(_LONG**2 * values[0], _KNOB**2 / 12)
+        main = vectors[:, 1] if elongated else np.array([1.0, 0.0])
     else:
-        main = np.array([0.0, 1.0])
+        main = np.array([1.0, 0.0])
     cross = np.array([-main[1], main[0]])
     along, across = flat @ main, flat @ cross
     low, high = np.percentile(along, (1, 99))

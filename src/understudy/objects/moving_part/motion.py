@@ -19,8 +19,9 @@ _STEP: Final = 0.0125  # metres of the part's origin, of the coarse grid
 _FASTEST: Final = 1.2  # metres per second
 _STIFF: Final = 0.15  # cost of a way of 10 cm, in units of the agreement
 _HAND_WEIGHT: Final = 0.5
-_GRIP: Final = 4.0  # cost of doing so where the hand is not
+_GRIP: Final = 4.0  # cost of taking hold and of letting go where the hand is not
 _TAKE: Final = 0.1  # cost of taking hold and of letting go
+_BEYOND, _FAR_BEYOND = 0.25, 0.6  # metres that the part may go farther than the hand; if that is not trusted
 _LONGEST: Final = 1.8  # metres
 _MOST: Final = 2.3  # radians either way
 _CHUNK: Final = 50_000  # point comparisons at a time: temporaries stay in the cache
@@ -48,15 +49,18 @@ def track(
     times_s: Float[np.ndarray, " t"],
     rest_until: int,
     sigma_m: float = 0.01,
+    trust: float = 1.0,
 ) -> Motion:
     """The likeliest course of q through all frames, at rest up to a given frame.
 
     A path through a grid of q with two states (Viterbi): either the hand holds the part, is near it, and the part may
-    move; or the hand is elsewhere and the part stays where it is.
+    move; or the hand is elsewhere and the part stays where it is. trust: weight of where the hand is: little, once it
+    is known what moves and how.
     """
     unit = 1 / step_m(articulation)
     near = hand_q(articulation, hand.positions)
-    low, high = (near.min() - 0.25 * unit, near.max() + 0.25 * unit)
+    beyond = (_BEYOND if trust == 1 else _FAR_BEYOND) * unit
+    low, high = near.min() - beyond, near.max() + beyond
     if articulation.kind == REVOLUTE:
         low, high = max(low, -_MOST), min(high, _MOST)
     low, high = max(min(low, -0.05 * unit), -_LONGEST * unit), min(max(high, 0.05 * unit), _LONGEST * unit)
@@ -67,10 +71,10 @@ def track(
     score = agreement_on(scorer, model, articulation, places, np.arange(t), sigma_m)
     score[: rest_until + 1] -= 3.0 * (np.arange(k) != -first)
     cost = hand_cost(articulation, places, hand.positions, hand.sigma_m)
-    grip = _TAKE + _GRIP * minimum_filter1d(
+    grip = _TAKE + trust * _GRIP * minimum_filter1d(
         cost, samples(times_s, 0.4), axis=0, mode="nearest"
     )  # one bad position must not matter
-    path, holds = _viterbi(score, score - _HAND_WEIGHT * cost, grip, times_s)
+    path, holds = _viterbi(score, score - trust * _HAND_WEIGHT * cost, grip, times_s)
     return Motion(grid[path], score[np.arange(t), path], holds)
 
 
@@ -171,11 +175,11 @@ def refine(
     q: Float[np.ndarray, " t"],
     frames: Int[np.ndarray, " k"],
     sigma_m: float = 0.008,
-    evaluations: int = 110,
+    evaluations: int = 60,
 ) -> tuple[Articulation, float]:
     """Articulation (and thickness of the front) that agrees best with some frames, q being free near where it is.
 
-    A weak preference for the start (3 degrees) decides what the depth leaves open.
+    A weak preference for the start (1 degree) decides what the depth leaves open.
     """
     local = np.linspace(-0.02, 0.02, 7)
     near = q[frames]
@@ -189,7 +193,7 @@ def refine(
         grid = near[:, None] + local / step_m(articulation)
         s = agreement_on(scorer, m, a, grid, frames, sigma_m)
         return float(
-            -s.max(1).mean() + 0.003 * ((x[:2] / 0.05) ** 2).sum() + 0.004 * ((m.thickness_m - 0.022) / 0.012) ** 2
+            -s.max(1).mean() + 0.003 * ((x[:2] / 0.02) ** 2).sum() + 0.004 * ((m.thickness_m - 0.022) / 0.012) ** 2
         )
 
     n = len(scale)
@@ -202,9 +206,12 @@ def refine(
 
 
 def spread_frames(q: Float[np.ndarray, " t"], usable: np.ndarray, n: int) -> Int[np.ndarray, " k"]:
-    """Up to n usable frames whose q are spread over its range."""
+    """Up to n usable frames: half spread over the range of q, the others over the time since it is not at rest."""
     index = np.flatnonzero(usable)
     order = index[np.argsort(q[index], kind="stable")]
-    reach = np.linspace(q[order[0]], q[order[-1]], n)
+    reach = np.linspace(q[order[0]], q[order[-1]], n - n // 2)
     picked = order[np.searchsorted(q[order], reach).clip(0, len(order) - 1)]
-    return np.unique(np.concatenate([picked, index[np.linspace(0, len(index) - 1, max(n // 3, 2)).astype(int)]]))
+    later = index[index >= np.argmax(q != 0)] if (q[index] != 0).any() else index
+    if not len(later):
+        later = index
+    return np.unique(np.concatenate([picked, later[np.linspace(0, len(later) - 1, n // 2).astype(int)], index[:1]]))

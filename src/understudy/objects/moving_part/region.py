@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import cv2
@@ -12,7 +12,8 @@ from jaxtyping import Float, Int
 from understudy.geometry import transform_points
 from understudy.objects.articulation import PRISMATIC, Articulation
 from understudy.objects.moving_part.scoring import PartModel, Scorer, motions, point_scores
-from understudy.objects.moving_part.stack import Reference
+from understudy.objects.moving_part.search import fit_plane, step_m
+from understudy.objects.moving_part.stack import Reference, left
 
 _REACH: Final = (1.25, 2.2)  # metres from the grasp: level, upright
 _HEIGHT: Final = (-0.02, 0.13)  # metres above the front's plane
@@ -23,6 +24,7 @@ _INFORMATIVE: Final = 0.03  # metres that a point must have gone for a frame to 
 _SIGMA: Final = 0.01
 _CONTRADICTED: Final = -0.35  # evidence below which a point stays where it is, even if edges are uncertain
 _IN_PLANE: Final = 0.3  # of the direction along the normal
+_FIT_FROM: Final = 60  # flat points
 _STRICT: Final = 0.006
 
 
@@ -45,12 +47,15 @@ def grow(
 ) -> Region | None:
     """The part's points from the reference, judged by k frames with known q; None if next to nothing moves so."""
     at = articulation.T_rest[:3, 3]
+    way = np.abs(q) * step_m(articulation)
     plane = float(model.points[model.flat].mean(0) @ model.normal)
     offset = ref.points - at
     height = ref.points @ model.normal - plane
     near = (ref.z > 0) & (height > _HEIGHT[0]) & (height < _HEIGHT[1])
     near &= (np.hypot(offset[..., 0], offset[..., 1]) < _REACH[0]) & (np.abs(offset[..., 2]) < _REACH[1])
     near &= (np.abs(height) < _ON_PLANE) | (height > _OUT)
+    if not _in_plane(articulation, model.normal):
+        near &= left(scorer.stack, ref, frames[way > 0.5 * way.max()]) if way.max() > _INFORMATIVE else True
     step = max(1, int(np.ceil(np.sqrt(near.sum() / _POINTS))))
     rows, columns = np.nonzero(near[::step, ::step])
     rows, columns = rows * step, columns * step
@@ -61,7 +66,7 @@ def grow(
     )
     gone, fit, news = _judge(scorer, everything, articulation, q, frames)
     belongs = (fit > 0.25) & (gone > -0.1)
-    if articulation.kind == PRISMATIC and abs(float(articulation.direction @ model.normal)) < _IN_PLANE:
+    if _in_plane(articulation, model.normal):
         # A front that slides covers its own place, and nothing says which points near its leading edge have moved: it
         # reaches to where its plane ends, or to what clearly stays.
         belongs |= everything.flat & (gone > _CONTRADICTED)
@@ -70,7 +75,22 @@ def grow(
         return None
     z = ref.z[rows, columns]
     area = (z * step / scorer.stack.camera.fx) ** 2
-    return Region(everything.part(chosen), float((news * area)[chosen].sum()), np.column_stack([rows, columns])[chosen])
+    return Region(
+        _fitted(everything.part(chosen)), float((news * area)[chosen].sum()), np.column_stack([rows, columns])[chosen]
+    )
+
+
+def _in_plane(articulation: Articulation, normal: Float[np.ndarray, "3"]) -> bool:
+    return articulation.kind == PRISMATIC and abs(float(articulation.direction @ normal)) < _IN_PLANE
+
+
+def _fitted(model: PartModel) -> PartModel:
+    """With the normal that its flat points show."""
+    flat = model.points[model.flat]
+    if len(flat) < _FIT_FROM:
+        return model
+    normal = fit_plane(flat)[0]
+    return replace(model, normal=normal * np.sign(normal @ model.normal))
 
 
 def _judge(

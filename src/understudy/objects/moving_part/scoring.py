@@ -71,6 +71,12 @@ class Scorer:
         self._rays = np.ascontiguousarray(rays.reshape(-1, 3))
         self._z = _marked(stack, ref).reshape(len(stack), -1)
 
+    def from_behind(self, model: PartModel, motion: Float[np.ndarray, "n 4 4"]) -> Bool[np.ndarray, " n"]:
+        """Whether the camera looks at the back of the front."""
+        T = self._T_cam_world @ motion
+        middle = T[:, :3, :3] @ model.points.mean(0) + T[:, :3, 3]
+        return np.asarray(np.einsum("ni,ni->n", T[:, :3, :3] @ model.normal, middle) > 0)
+
     def compare(
         self, model: PartModel, motion: Float[np.ndarray, "n 4 4"], frames: Int[np.ndarray, " n"]
     ) -> Comparison:
@@ -81,9 +87,7 @@ class Scorer:
         height = (model.normal @ motion[:, :3, :3]) @ model.points.T + (motion[:, :3, 3] @ model.normal)[:, None]
         home = np.abs(height - front) < _HOME
         normal = T[:, :3, :3] @ model.normal.astype(np.float32)
-        # the back of the front is seen when its outside looks away from the camera
-        middle = model.points.mean(0).astype(np.float32)
-        away = np.einsum("ni,ni->n", normal, T[:, :3, :3] @ middle + T[:, :3, 3]) > 0
+        away = self.from_behind(model, motion)
         points = model.points.astype(np.float32).T
         p = T[:, :3, :3] @ points + T[:, :3, 3, None]  # (n, 3, m)
         p -= (away * np.float32(model.thickness_m))[:, None, None] * normal[:, :, None]
@@ -161,3 +165,9 @@ def _marked(stack: DepthStack, ref: Reference) -> UInt16[np.ndarray, "t h w"]:
 def motions(articulation: Articulation, q: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 4 4"]:
     """Takes points of the part at rest to where they are at q."""
     return articulation.pose(q) @ inverse(articulation.T_rest)
+
+
+def in_part(articulation: Articulation, q: np.ndarray, positions: np.ndarray) -> Float[np.ndarray, "n 3"]:
+    """Points that are on the part at q, brought back to where they are at rest (world)."""
+    T = np.linalg.inv(motions(articulation, q))
+    return np.asarray(np.einsum("nij,nj->ni", T[:, :3, :3], positions) + T[:, :3, 3])

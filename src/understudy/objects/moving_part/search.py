@@ -28,6 +28,7 @@ _FLAPS: Final = np.arange(0.15, 0.71, 0.1)
 _SPAN: Final = 0.16  # metres of q around the hand's that are tried
 _SIGMA: Final = 0.02
 _POINTS: Final = 120
+_ENOUGH: Final = 150  # points that moved: then the panel is among them
 _FRAMES: Final = 8
 _WINDOW_S: Final = 0.4  # of the running median
 _HAND_WEIGHT: Final = 0.3
@@ -98,30 +99,21 @@ def find_panel(
     """The upright plane near a point, and the points that make the first model of what moves. eye: the camera."""
     rng = np.random.default_rng(0)
     near = (ref.z > 0) & (np.abs(ref.points - at).max(-1) < _PATCH)
+    if near.sum() < 60:
+        return None
+    loose = near & moved
+    fitted = _upright_plane(ref.points[loose if loose.sum() > _ENOUGH else near], rng)
+    if fitted is None:
+        return None
+    n, center = _wider(ref, loose if loose.sum() > _ENOUGH else ref.z > 0, at, fitted)
+    n = n if n @ (eye - center) > 0 else -n
     points = ref.points[near]
-    if len(points) < 60:
-        return None
-    sample = points[rng.permutation(len(points))[:600]]
-    a, b, c = sample[rng.integers(0, len(sample), (3, 200))]
-    normal = np.cross(b - a, c - a)
-    length = np.linalg.norm(normal, axis=1)
-    good = length > 1e-3
-    normal = normal[good] / length[good, None]
-    a = a[good][np.abs(normal[:, 2]) < _STEEP]
-    normal = normal[np.abs(normal[:, 2]) < _STEEP]
-    if not len(normal):
-        return None
-    distance = np.abs(sample @ normal.T - np.einsum("ij,ij->i", normal, a))
-    best = int(np.argmax((distance < _ON_PLANE).sum(0)))
-    inliers = points[np.abs((points - a[best]) @ normal[best]) < _ON_PLANE]
-    if len(inliers) < 40:
-        return None
-    n, center = _plane(inliers, eye)
     height = (points - center) @ n
     flat = np.abs(height) < _ON_PLANE
     out = (height > _OUT[0]) & (height < _OUT[1])
-    loose = moved[near]
-    chosen = (flat | out) & loose
+    if flat.sum() < 40:
+        return None
+    chosen = (flat | out) & moved[near]
     if chosen.sum() < 40:  # a front that slides covers its own place: nothing of it seems to have moved
         chosen = flat | out
     up = np.array([0, 0, 1.0]) - n * n[2]
@@ -132,11 +124,40 @@ def find_panel(
     return Panel(model, rigid(R, origin), frame)
 
 
-def _plane(points: np.ndarray, eye: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Unit normal towards the camera, and the centre."""
+Plane = tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]
+"""Unit normal and a point."""
+
+
+def _upright_plane(points: Float[np.ndarray, "n 3"], rng: np.random.Generator) -> Plane | None:
+    """The upright plane through most of the points (random triples, then least squares)."""
+    sample = points[rng.permutation(len(points))[:600]]
+    a, b, c = sample[rng.integers(0, len(sample), (3, 200))]
+    normal = np.cross(b - a, c - a)
+    length = np.linalg.norm(normal, axis=1)
+    good = (length > 1e-3) & (np.abs(normal[:, 2]) < _STEEP * length)
+    if not good.any():
+        return None
+    normal, a = normal[good] / length[good, None], a[good]
+    best = int(np.argmax((np.abs(sample @ normal.T - np.einsum("ij,ij->i", normal, a)) < _ON_PLANE).sum(0)))
+    inliers = points[np.abs((points - a[best]) @ normal[best]) < _ON_PLANE]
+    return fit_plane(inliers) if len(inliers) >= 40 else None
+
+
+def _wider(ref: Reference, usable: Bool[np.ndarray, "h w"], at: np.ndarray, plane: Plane) -> Plane:
+    """Fitted again to what it holds farther around: a small patch says little about its tilt."""
+    for reach in (1.0, 1.5, 2.0):
+        near = usable & (np.abs(ref.points - at).max(-1) < reach * _PATCH)
+        points = ref.points[near]
+        points = points[np.abs((points - plane[1]) @ plane[0]) < _ON_PLANE]
+        if len(points) >= 40:
+            plane = fit_plane(points)
+    return plane
+
+
+def fit_plane(points: Float[np.ndarray, "n 3"]) -> Plane:
+    """Least squares."""
     center = points.mean(0)
-    normal = np.linalg.svd(points - center, full_matrices=False)[2][2]
-    return (normal if normal @ (eye - center) > 0 else -normal), center
+    return np.linalg.eigh(np.cov((points - center).T))[1][:, 0], center
 
 
 def hypotheses(panel: Panel) -> Iterator[tuple[str, Articulation]]:

@@ -180,3 +180,12 @@ def changed(stack: DepthStack, ref: Reference, frames: Int[np.ndarray, " k"]) ->
     same = (np.abs(z - ref.z) < tolerance) & seen
     n = seen.sum(0)
     return np.asarray((ref.z > 0) & (n >= 2) & (same.sum(0) < 0.25 * n))
+
+
+def left(stack: DepthStack, ref: Reference, frames: Int[np.ndarray, " k"]) -> Bool[np.ndarray, "h w"]:
+    """Reference surface that does not stay in these frames: what no frame says anything about may have gone, too."""
+    picked = frames[np.unique(np.linspace(0, len(frames) - 1, min(len(frames), 12)).astype(int))]
+    z = stack.z[picked].astype(np.float32) * UNIT
+    seen = (z > 0) & ~stack.person[picked]
+    same = (np.abs(z - ref.z) < np.maximum(0.015, 4 * ref.spread)) & seen
+    return np.asarray((ref.z > 0) & (same.sum(0) <= 0.5 * seen.sum(0)))
