@@ -129,6 +129,33 @@ def test_depth_resolves_the_mirrored_pose() -> None:
     assert np.median(np.abs(with_depth)[:, 2]) < 1.2 * np.median(np.abs(without)[:, 2]) + 0.002
 
 
+def test_following_loses_nothing() -> None:
+    """A tag that drifts, jumps across the image, hides, and comes back far away: found in each frame that shows it, as
+    well as by looking at that frame alone.
+    """
+    tracker = MarkerTracker({7: SIZE_M})
+    places = [(-0.5, 1.5), (-0.48, 1.55), (0.6, 1.5), None, (-0.4, 3.2), (-0.35, 3.2)]
+    for k, place in enumerate(places):
+        T = pose(1.0, 20, 5)
+        T[:3, 3] = (0, 0.1, 1) if place is None else (place[0], 0.1, place[1])
+        frame = rendered({} if place is None else {7: T}, k)
+        found, alone = tracker.detect(frame), MarkerTracker({7: SIZE_M}).detect(frame)
+        assert set(found) == set(alone) == (set() if place is None else {7})
+        if place is not None:
+            assert np.linalg.norm(error(T, found[7].T_cam_marker)[:3]) < 0.01
+            assert np.abs(found[7].corners_2d - alone[7].corners_2d).max() < 0.3
+
+
+def test_a_tag_that_is_there_twice_is_left_out() -> None:
+    T, other = pose(1.2, 10, 3), pose(1.2, 10, 3)
+    T[:3, 3], other[:3, 3] = (-0.4, 0, 1.2), (0.4, 0, 1.2)
+    frame = rendered({7: T})
+    both = frame.color.copy()
+    both[:, 640:] = rendered({7: other}).color[:, 640:]
+    assert set(MarkerTracker(SIZE_M).detect(frame)) == {7}
+    assert MarkerTracker(SIZE_M).detect(RegisteredFrame(both, CAMERA, frame.depth)) == {}
+
+
 def test_without_depth_pixels_colour_alone_is_used() -> None:
     T = pose(1.0, 30, 1)
     frame = rendered({7: T})
