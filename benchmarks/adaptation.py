@@ -149,8 +149,8 @@ def _gtsam_graph(gtsam, graph: Graph, start: State):
         def error(this, v, H):
             q = v.atPose2(next(iter(this.keys())))
             base = np.array([[q.x(), q.y(), q.theta()]])
-            points, radii = graph.footprint_points
-            e, J = edges.base_clearance(around.obstacles, points, radii, base, graph.margins.obstacle)
+            margin = graph.margins.obstacle
+            e, J = edges.map_clearance(around.map, around.obstacles, platform.footprint, base, margin)
             if H is not None:
                 H[0] = np.asfortranarray(J[0])
             return e[0]
@@ -158,7 +158,7 @@ def _gtsam_graph(gtsam, graph: Graph, start: State):
         return error
 
     around = {i: s for s in p.surroundings for i in range(s.steps.start, s.steps.stop)}
-    near = sigmas(np.full(len(graph.footprint_points[1]), w.obstacle))
+    near = sigmas(np.full(len(platform.footprint), w.obstacle))
     grasp = sigmas(np.repeat(w.grasp, 3)[swap])
     for i in range(len(start.torso)):
         G, B, Z = key("g", i), key("b", i), key("h", i)

@@ -15,7 +15,8 @@ from understudy import lie
 from understudy.adaptation.calibration import DEFAULT_HAND_TOOL
 from understudy.adaptation.grasps import GraspFamily
 from understudy.adaptation.platform import Platform
-from understudy.demonstration.demonstration import FREE, OCCUPIED, TASKS, UNKNOWN, Demonstration, OccupancyMap, Segments
+from understudy.demonstration.demonstration import FREE, OCCUPIED, UNKNOWN, Demonstration, OccupancyMap, Segments
+from understudy.demonstration.tasks import TASKS
 from understudy.objects.articulation import Articulation, Handle
 from understudy.trajectories import PlanarTrack, PoseTrack
 

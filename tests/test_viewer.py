@@ -12,13 +12,13 @@ import pytest
 
 from understudy.camera import Camera, RGBDCamera
 from understudy.errors import MissingExtraError, RecordingError, UnderstudyError
+from understudy.floor import find_floor
 from understudy.overlay import person_color
 from understudy.people_file import FramePeople, PeopleFile
 from understudy.recordings import FolderWriter
 from understudy.types import Frame, Keypoints2D, Palm, Person, RegisteredDepth, RegisteredFrame
 from understudy.viewer.app import Viewer, free_port, is_local, view
 from understudy.viewer.cloud import make_cloud, near_people
-from understudy.floor import find_floor
 from understudy.viewer.panel import describe_joints, people_html
 from understudy.viewer.results import Cache, Moment, Results
 from understudy.viewer.scene import shade, view_point

@@ -8,20 +8,19 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 
 from understudy import lie
-from understudy.adaptation import calibration as calibrations
-from understudy.adaptation import grasps, prepare
+from understudy.adaptation import prepare
 from understudy.adaptation.calibration import Calibration
 from understudy.adaptation.errors import InfeasibleError
 from understudy.adaptation.explain import conflicts, energies_over_time
 from understudy.adaptation.fields import collision_free
 from understudy.adaptation.graph import Graph, Problem, State
-from understudy.adaptation.placement import Search, estimate_torso_base, search_path
 from understudy.adaptation.platform import Platform
 from understudy.adaptation.result import AdaptationResult, Adapted, Report
 from understudy.adaptation.solver import Chain, Convergence, Iteration, Stop, Stopwatch, minimise
+from understudy.adaptation.start import Starts
 from understudy.adaptation.weights import SCHEDULE, Limits, Margins, Stage, Weights
 from understudy.demonstration.demonstration import Demonstration
 from understudy.errors import UnderstudyError
@@ -29,9 +28,6 @@ from understudy.errors import UnderstudyError
 if TYPE_CHECKING:
     from understudy.robot.model import Robot
 
-_HEIGHTS: Final = (0.5, 0.85, 0.15)  # of the torso, shares of its range, in the order in which they are tried
-_WELL_PLACED: Final = 5.0  # cost of the coarse search (placement.search_path) at which no other height is tried
-_UNREACHED: Final = 40.0  # above this, another grasp is tried
 _LOOSE: Final = 0.002  # metres and radians: a grasp that is missed by more is none
 _EXACT: Final = 0.0005  # the same, of a good one
 _NEARLY: Final = 0.93  # of a limit: where its edges begin to push
@@ -39,8 +35,8 @@ _SLOWER: Final = 1.15  # least factor by which the clock is slowed down further
 _SLOWEST: Final = 5.0  # times the demonstration's clock: beyond, time is not what is short
 _AROUND: Final = 3  # samples beside a failure whose margins are tightened, too
 _REACH_STEP: Final = 0.015  # metres by which margins are tightened
-_OBSTACLE_STEP: Final = 0.015
-_MOST_OBSTACLE: Final = 0.04  # in all: more would close doorways
+_OBSTACLE_STEP: Final = 0.01
+_MOST_OBSTACLE: Final = 0.02  # in all: more would close doorways
 
 
 @dataclass(frozen=True)
@@ -97,18 +93,6 @@ def _check(demonstrations: Sequence[Demonstration]) -> None:
             raise UnderstudyError(f"adapt: demonstration {i}: the hand never takes hold (segments.grasp at the end)")
 
 
-@dataclass(frozen=True, eq=False)
-class _Start:
-    """A grasp with everything that follows from it before the graph is solved."""
-
-    family: grasps.GraspFamily
-    calibration: Calibration
-    graph: Graph
-    state: State
-    worst: float
-    """of the coarse search"""
-
-
 class _Adaptation:
     """One call of `adapt`."""
 
@@ -120,9 +104,13 @@ class _Adaptation:
 
     def run(self) -> AdaptationResult:
         """The whole course."""
-        start = self.start()
-        watch = Stopwatch()
-        graph, state, course = start.graph, start.state, list[Iteration]()
+        starts = Starts(self.demonstrations, self.platform, self.config.calibration, self.obstacles)
+        if not len(starts.hands()):
+            self.notes.append("no hand was measured on the object: the grasp is a frontal one, X is the default")
+        start = starts.best()
+        config, watch = self.config, Stopwatch()
+        graph = Graph(self.clocked(start.problem), self.platform, config.weights, config.margins, config.limits)
+        state, course = start.state, list[Iteration]()
         converged = True
         for number, stage in enumerate(self.config.schedule):
             state, part, converged = _solve(graph, state, stage, number)
@@ -142,69 +130,13 @@ class _Adaptation:
         first = self.demonstrations[0]
         return AdaptationResult(first.task, self.platform.name, adapted, graph.problem.grasp, start.calibration, report)
 
-    def start(self) -> _Start:
-        """The best grasp that a base can serve: in the order of their nearness to the hands."""
-        given = self.config.calibration or Calibration.default()
-        hands = calibrations.typical_hands(self.demonstrations) @ given.T_hand_tool
-        if not len(hands):
-            self.notes.append("no hand was measured on the object: the grasp is a frontal one, X is the default")
-        best: _Start | None = None
-        for family, grasp in grasps.ranked(self.demonstrations[0].handle, self.platform, hands):
-            start = self.start_with(family, grasp)
-            if best is None or start.worst < best.worst:
-                best = start
-            if best.worst <= _UNREACHED:
-                break
-        assert best is not None
-        return best
-
-    def start_with(self, family: grasps.GraspFamily, grasp: Float[np.ndarray, "4 4"]) -> _Start:
-        """Calibration, first guesses of gripper and base for one grasp."""
-        config, platform = self.config, self.platform
-        X = calibrations.estimate_hand_tool(self.demonstrations, grasp)
-        calibration = config.calibration or Calibration(X, calibrations.DEFAULT_TORSO_BASE)
-        problem = self.stacked(calibration, grasp)
-        gripper = prepare.first_gripper(problem, grasp)
-        search = Search(problem, platform, gripper, platform.torso_rest)
-        if config.calibration is None:
-            torso = [prepare.first_base(d, np.zeros(3)) for d in self.demonstrations]
-            Y = estimate_torso_base(search, torso, calibration.torso_base)
-            calibration = Calibration(X, Y)
-            problem = self.stacked(calibration, grasp)
-        base, height, worst = self.placed(Search(problem, platform, gripper, platform.torso_rest), calibration)
-        graph = Graph(problem, platform, config.weights, config.margins, config.limits)
-        state = State(gripper, base, np.full(len(base), height), grasp)
-        return _Start(family, calibration, graph, state, worst)
-
-    def stacked(self, calibration: Calibration, grasp: Float[np.ndarray, "4 4"]) -> Problem:
+    def clocked(self, problem: Problem) -> Problem:
         """The problem, on a clock that is slow enough for the gripper to go with the part."""
-        problem = prepare.stacked(self.demonstrations, calibration, grasp, self.obstacles)
         if self.config.slow_down:
             limits, share = self.config.limits, self.config.margins.speed
             speed, turning = prepare.needed_speeds(problem)
             self.slower = max(1.0, speed / (share * limits.speed), turning / (share * limits.turning))
         return replace(problem, dt=self.slower * problem.dt)
-
-    def placed(self, search: Search, calibration: Calibration) -> tuple[Float[np.ndarray, "n 3"], float, float]:
-        """Base paths of all demonstrations, the torso's height, and the worst cost of the search.
-
-        The torso is slow, so one height is sought for all: the middle of its range, others only where that fails.
-        """
-        low, high = self.platform.torso_limits
-        best: tuple[np.ndarray, float, float] | None = None
-        for share in _HEIGHTS:
-            search = replace(search, torso=low + share * (high - low))
-            found = [
-                search_path(search, around, prepare.first_base(d, calibration.torso_base))
-                for around, d in zip(search.problem.surroundings, self.demonstrations, strict=True)
-            ]
-            worst = max(cost for _, cost in found)
-            if best is None or worst < best[2]:
-                best = np.concatenate([path for path, _ in found]), search.torso, worst
-            if worst <= _WELL_PLACED:
-                break
-        assert best is not None
-        return best
 
     def tighten(self, graph: Graph, state: State, converged: bool) -> tuple[State, int, list[Iteration], bool]:
         """Larger margins where exact checks fail, and the last stage again, until nothing fails."""
@@ -264,6 +196,7 @@ class _Adaptation:
                 state.torso[s],
                 achieved[s],
                 free[s],
+                graph.problem.grasps(graph.problem.grasp, np.array([s.start]))[0][0],
                 {kind: values[s] for kind, values in energies.items()},
             )
             for s, d in self.each()

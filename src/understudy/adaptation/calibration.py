@@ -10,6 +10,8 @@ import numpy as np
 from jaxtyping import Float
 
 from understudy import lie
+from understudy.adaptation.parts import mirrored_sides
+from understudy.adaptation.problem import mirror
 from understudy.demonstration.demonstration import Demonstration
 
 _SPREAD: Final = np.array([0.05] * 3 + [np.radians(20)] * 3)  # residuals of this size lose half of their weight
@@ -26,6 +28,7 @@ def _default_hand_tool() -> Float[np.ndarray, "4 4"]:
 
 DEFAULT_HAND_TOOL: Final = _default_hand_tool()
 """X: T_hand_tool"""
+_ROLL: Final = np.diag([1.0, -1.0, -1.0, 1.0])  # half a turn about the approach
 DEFAULT_TORSO_BASE: Final = np.array([-0.2, 0.0, 0.0])
 """Y: (x, y, yaw) of the base seen from the torso: somewhat farther from the work, for a base is wider than a person"""
 
@@ -38,6 +41,12 @@ class Calibration:
     """X: a gripper at H X is where the hand is"""
     torso_base: Float[np.ndarray, "3"]
     """Y: metres, metres, radians; a base at P Y is where the torso is"""
+    T_left_tool: Float[np.ndarray, "4 4"] | None = None
+    """X of left hands, where both sides act; None: `T_hand_tool` is of either"""
+
+    def hand_tool(self, acting: str) -> Float[np.ndarray, "4 4"]:
+        """X of the acting hand: 'left' or 'right'."""
+        return self.T_hand_tool if acting == "right" or self.T_left_tool is None else self.T_left_tool
 
     @classmethod
     def default(cls) -> Calibration:
@@ -75,9 +84,38 @@ def typical_hands(demonstrations: Sequence[Demonstration]) -> Float[np.ndarray, 
     return np.array(means) if means else np.zeros((0, 4, 4))
 
 
+def typical_tools(demonstrations: Sequence[Demonstration], calibration: Calibration) -> Float[np.ndarray, "d 4 4"]:
+    """Where a gripper at H X would hold the object, in the object's frame, of every demonstration that shows it.
+
+    Those of doors hung on the other side are mirrored. A left hand holds a bar the other way up than a right one; a
+    gripper is the same both ways, so left hands' are rolled by half a turn where X is not their own.
+    """
+    mirrored, out = mirrored_sides(demonstrations), []
+    both = len({d.acting for d in demonstrations}) > 1 and calibration.T_left_tool is None
+    for d, other_side in zip(demonstrations, mirrored, strict=True):
+        for hand in typical_hands([d]):
+            tool = hand @ calibration.hand_tool(d.acting) @ (_ROLL if both and d.acting == "left" else np.eye(4))
+            out.append(mirror(tool) if other_side else tool)
+    return np.array(out) if out else np.zeros((0, 4, 4))
+
+
+def estimate_hand_tools(
+    demonstrations: Sequence[Demonstration], grasp: Float[np.ndarray, "4 4"]
+) -> tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "4 4"] | None]:
+    """X, the mean of H^-1 O g over how the hands hold the object; and that of left hands, where both sides act.
+
+    grasp: as in the first demonstration. The default for a side of which no hand is seen.
+    """
+    found: dict[str, list[np.ndarray]] = {d.acting: [] for d in demonstrations}
+    for d, other_side in zip(demonstrations, mirrored_sides(demonstrations), strict=True):
+        held = mirror(grasp) if other_side else grasp
+        found[d.acting] += [lie.se3_inverse(T) @ held for T in typical_hands([d])]
+    X = {side: mean_pose(np.array(tools)) if tools else DEFAULT_HAND_TOOL.copy() for side, tools in found.items()}
+    return (X["right"], X["left"]) if len(X) == 2 else (next(iter(X.values())), None)
+
+
 def estimate_hand_tool(
     demonstrations: Sequence[Demonstration], grasp: Float[np.ndarray, "4 4"]
 ) -> Float[np.ndarray, "4 4"]:
-    """X, the mean of H^-1 O g over how the hands hold the object. The default if no hand is seen."""
-    hands = typical_hands(demonstrations)
-    return mean_pose(lie.se3_inverse(hands) @ grasp) if len(hands) else DEFAULT_HAND_TOOL.copy()
+    """X of right hands, or of the only side that acts (see `estimate_hand_tools`)."""
+    return estimate_hand_tools(demonstrations, grasp)[0]

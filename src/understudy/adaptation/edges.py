@@ -13,8 +13,9 @@ import numpy as np
 from jaxtyping import Float
 
 from understudy import lie
-from understudy.adaptation.fields import DistanceField, polygon_distance
+from understudy.adaptation.fields import DistanceField, cells_near, half_planes, polygon_distance
 from understudy.adaptation.platform import Reachability
+from understudy.demonstration.demonstration import OccupancyMap
 
 SOFT_M: Final = 0.01
 """half width of the parabola that rounds off the hinges of distances"""
@@ -53,7 +54,7 @@ def between_planar(
 
 
 def rigid_grasp(
-    grasp: Float[np.ndarray, "4 4"], object: Float[np.ndarray, "n 4 4"], T: Float[np.ndarray, "n 4 4"]
+    grasp: Float[np.ndarray, "*n 4 4"], object: Float[np.ndarray, "n 4 4"], T: Float[np.ndarray, "n 4 4"]
 ) -> tuple[Float[np.ndarray, "n 6"], Float[np.ndarray, "n 6 6"], Float[np.ndarray, "n 6 6"]]:
     """Log(g^-1 O^-1 T): the gripper stays where it took hold. Jacobians over T and over g, which all share."""
     e = lie.se3_log(lie.se3_inverse(object @ grasp) @ T)
@@ -98,6 +99,45 @@ def base_clearance(
     local = gradient.reshape(-1, k, 2) @ turn
     yaw = points[:, 0] * local[..., 1] - points[:, 1] * local[..., 0]
     J[near] = -on[..., None] * np.concatenate([local, yaw[..., None]], axis=2)
+    return e, J
+
+
+def map_clearance(
+    map: OccupancyMap,
+    field: DistanceField,
+    polygon: Float[np.ndarray, "k 2"],
+    base: Float[np.ndarray, "n 3"],
+    margin: float,
+) -> tuple[Float[np.ndarray, "n k"], Float[np.ndarray, "n k 3"]]:
+    """max(0, half a cell + margin - distance to the footprint) of the deepest occupied cell at each side of it.
+
+    Of cells, not of points of the footprint: a thin wall or a single cell under the footprint is pushed out to the
+    nearest side, whereas points to both sides of it would pull in opposite directions. field: the map's, tells where
+    no closer look is needed. Jacobian over the base.
+    """
+    n, k = len(base), len(polygon)
+    e, J = np.zeros((n, k)), np.zeros((n, k, 3))
+    room = margin + SOFT_M + 0.5 * map.resolution_m
+    far = float(np.linalg.norm(polygon, axis=1).max()) + room
+    near = np.flatnonzero(field.at(base[:, :2])[0] < far + field.cell_m)
+    pose, row, column = cells_near(map, base[near], far)
+    turn = _turns(base[near])
+    away = map.origin_xy + map.resolution_m * np.column_stack([column, row]) - base[near][pose, :2]
+    local = np.einsum("mi,mij->mj", away, turn[pose])
+    normals, offsets = half_planes(polygon)
+    heights = local @ normals.T - offsets
+    close = np.flatnonzero(heights.max(axis=1) < room)
+    side = np.argmax(heights[close], axis=1)
+    d, gradient = polygon_distance(polygon, local[close])
+    keys = k * pose[close] + side
+    order = np.lexsort((-d, keys))
+    last = order[np.append(keys[order][1:] != keys[order][:-1], True)] if len(order) else order
+    rows, sides = near[pose[close[last]]], side[last]
+    e[rows, sides], on = _hinge(0.5 * map.resolution_m + margin - d[last], SOFT_M)
+    g, p = gradient[last], local[close[last]]
+    # moving the base by d moves the cell, seen from the base, by -d
+    yaw = g[:, 1] * p[:, 0] - g[:, 0] * p[:, 1]
+    J[rows, sides] = on[:, None] * np.column_stack([g, yaw])
     return e, J
 
 

@@ -128,14 +128,16 @@ def collision_free(
     free = np.ones(len(base), bool)
     for start in range(0, len(base), _CHUNK):
         part = slice(start, start + _CHUNK)
-        pose, row, column = _cells_near(map, base[part], float(np.linalg.norm(polygon, axis=1).max()))
+        pose, row, column = cells_near(map, base[part], float(np.linalg.norm(polygon, axis=1).max()))
         hit = _overlaps(map, polygon, base[part][pose], row, column)
         free[start + pose[hit]] = False
     return free
 
 
-def _cells_near(map: OccupancyMap, base: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(pose, row, column) of every occupied cell in the square around each pose."""
+def cells_near(
+    map: OccupancyMap, base: Float[np.ndarray, "n 3"], radius: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(pose, row, column) of every occupied cell in the square around each pose (metres to its sides at least)."""
     reach = int(np.ceil(radius / map.resolution_m)) + 1
     centre = np.rint((base[:, 1::-1] - map.origin_xy[::-1]) / map.resolution_m).astype(int)
     window = np.arange(-reach, reach + 1)

@@ -7,6 +7,7 @@ a place along it, half a turn about the approach. Short grips (knobs) can also b
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -21,6 +22,7 @@ from understudy.objects.articulation import Handle
 _TURN: Final = np.radians(45)  # about the bar, to either side: beyond, the gripper would meet the front
 _END_M: Final = 0.02  # of the bar that must stay beyond the middle of the fingers
 _CLEARANCE_M: Final = 0.01  # between open fingers and the bar, in all
+_TURNS: Final = 5  # of a family, when others than the nearest are tried
 _RADIUS_M: Final = 0.3  # metres that count as much as a radian, when grasps are compared
 
 
@@ -86,6 +88,28 @@ def distance(a: Float[np.ndarray, "4 4"], b: Float[np.ndarray, "n 4 4"]) -> Floa
     return np.asarray(np.hypot(np.linalg.norm(b[:, :3, 3] - a[:3, 3], axis=1), _RADIUS_M * angle))
 
 
+def common_handle(handles: Sequence[Handle]) -> Handle:
+    """The handle that a grasp must suit to suit all: the shortest bar, the thickest, the nearest to its front."""
+    return Handle(
+        min(h.length_m for h in handles), max(h.radius_m for h in handles), min(h.standoff_m for h in handles)
+    )
+
+
+def turned(
+    family: GraspFamily, grasp: Float[np.ndarray, "4 4"], hands: Float[np.ndarray, "d 4 4"]
+) -> list[Float[np.ndarray, "4 4"]]:
+    """Grasps of a family turned about the bar as far as it allows, at the place of a chosen one; nearest first."""
+    if not family.turn:
+        return []
+    turns = family.members(np.linspace(-1, 1, _TURNS) * family.turn, np.full(_TURNS, grasp[2, 3]))
+    cost = _summed(turns, hands if len(hands) else grasp[None])
+    return [turns[i] for i in np.argsort(cost, kind="stable")]
+
+
+def _summed(members: Float[np.ndarray, "n 4 4"], hands: Float[np.ndarray, "d 4 4"]) -> Float[np.ndarray, " n"]:
+    return np.asarray(np.sum([distance(hand, members) for hand in hands], axis=0))
+
+
 def ranked(
     handle: Handle, robot: Platform, hands: Float[np.ndarray, "d 4 4"]
 ) -> list[tuple[GraspFamily, Float[np.ndarray, "4 4"]]]:
@@ -99,7 +123,7 @@ def ranked(
         slide = np.linspace(-family.slide_m, family.slide_m, 11 if family.slide_m else 1)
         grid = np.meshgrid(turn, slide, indexing="ij")
         members = family.members(grid[0].ravel(), grid[1].ravel())
-        cost = np.sum([distance(hand, members) for hand in hands], axis=0) if len(hands) else np.abs(grid[0].ravel())
+        cost = _summed(members, hands) if len(hands) else np.abs(grid[0].ravel())
         best = int(np.argmin(cost))
         found.append((float(cost[best]), family, members[best]))
     found.sort(key=lambda item: item[0])

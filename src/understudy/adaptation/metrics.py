@@ -102,6 +102,7 @@ class _Path:
     base: Float[np.ndarray, "t 3"]
     torso: Float[np.ndarray, " t"]
     times_s: Float[np.ndarray, " t"]
+    grasp: Float[np.ndarray, "4 4"]
 
 
 def evaluate(demonstrations: Sequence[Demonstration], result: AdaptationResult, robot: Platform) -> dict[str, Metrics]:
@@ -110,20 +111,20 @@ def evaluate(demonstrations: Sequence[Demonstration], result: AdaptationResult, 
         raise UnderstudyError(
             f"metrics: {len(demonstrations)} demonstrations, but a result of {len(result.demonstrations)}"
         )
-    before = [_before(d, result, robot) for d in demonstrations]
-    after = [_Path(a.T_world_tool, a.base, a.torso, a.times_s) for a in result.demonstrations]
+    before = [_before(d, a.grasp, result, robot) for d, a in zip(demonstrations, result.demonstrations, strict=True)]
+    after = [_Path(a.T_world_tool, a.base, a.torso, a.times_s, a.grasp) for a in result.demonstrations]
     return {
         "before": _metrics(demonstrations, before, result, robot),
         "after": _metrics(demonstrations, after, result, robot),
     }
 
 
-def _before(d: Demonstration, result: AdaptationResult, robot: Platform) -> _Path:
-    target, _ = prepare.hand_targets(d, result.calibration.T_hand_tool)
+def _before(d: Demonstration, grasp: Float[np.ndarray, "4 4"], result: AdaptationResult, robot: Platform) -> _Path:
+    target, _ = prepare.hand_targets(d, result.calibration.hand_tool(d.acting))
     seen = np.isfinite(target).all(axis=(1, 2))
-    tool = prepare.bridged(target, seen) if seen.any() else prepare.object_path(d) @ result.grasp
+    tool = prepare.bridged(target, seen) if seen.any() else prepare.object_path(d) @ grasp
     base = prepare.first_base(d, result.calibration.torso_base)
-    return _Path(tool, base, np.full(len(d), robot.torso_rest), d.times_s)
+    return _Path(tool, base, np.full(len(d), robot.torso_rest), d.times_s, grasp)
 
 
 def _metrics(
@@ -132,8 +133,8 @@ def _metrics(
     grasp, hand, reaching, gripper_object, hand_object = [], [], [], [], []
     for d, path in zip(demonstrations, paths, strict=True):
         object, k = prepare.object_path(d), d.segments.grasp
-        grasp.append(_size(lie.se3_inverse(object[k : k + 1] @ result.grasp) @ path.tool[k : k + 1]))
-        target, _ = prepare.hand_targets(d, result.calibration.T_hand_tool)
+        grasp.append(_size(lie.se3_inverse(object[k : k + 1] @ path.grasp) @ path.tool[k : k + 1]))
+        target, _ = prepare.hand_targets(d, result.calibration.hand_tool(d.acting))
         seen = np.isfinite(target).all(axis=(1, 2))
         away = _size(lie.se3_inverse(target[seen]) @ path.tool[seen])
         hand.append(away)

@@ -73,7 +73,7 @@ def comparison(results: Mapping[str, Mapping[str, Metrics]]) -> bytes:
 
 def _above(axes: Axes, d: Demonstration, a: Adapted, result: AdaptationResult, robot: Platform) -> None:
     _map(axes, d.map)
-    hand, _ = prepare.hand_targets(d, result.calibration.T_hand_tool)
+    hand, _ = prepare.hand_targets(d, result.calibration.hand_tool(d.acting))
     object = prepare.object_path(d)
     axes.plot(*d.torso.xy_yaw[:, :2].T, ".", color=_TEACHER, markersize=3, label="teacher's torso")
     axes.plot(*hand[:, :2, 3].T, "x", color=_TEACHER, markersize=4, markeredgewidth=0.8, label="teacher's hand (H X)")
@@ -113,7 +113,7 @@ def _footprint(axes: Axes, polygon: Float[np.ndarray, "k 2"], base: Float[np.nda
 
 def _side(axes: Axes, d: Demonstration, a: Adapted, result: AdaptationResult) -> None:
     """Across the direction in which the gripper moves most: heights are the point."""
-    hand, _ = prepare.hand_targets(d, result.calibration.T_hand_tool)
+    hand, _ = prepare.hand_targets(d, result.calibration.hand_tool(d.acting))
     p = a.T_world_tool[:, :3, 3]
     along = np.linalg.svd(p[:, :2] - p[:, :2].mean(axis=0), full_matrices=False)[2][0]
     object = prepare.object_path(d)

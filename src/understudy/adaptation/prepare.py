@@ -11,36 +11,19 @@ from jaxtyping import Bool, Float
 
 from understudy import lie
 from understudy.adaptation.calibration import Calibration
-from understudy.adaptation.errors import InfeasibleError
 from understudy.adaptation.fields import DistanceField, obstacle_field, point_field, unknown_field
-from understudy.adaptation.graph import Problem, Surroundings
+from understudy.adaptation.parts import mirrored_sides, object_path, panel_path
+from understudy.adaptation.problem import Problem, Surroundings
 from understudy.demonstration.demonstration import Demonstration, OccupancyMap
-from understudy.objects.articulation import PRISMATIC, REVOLUTE
 
 _UNORIENTED: Final = 1.5  # radians: of a rotation that was not measured
 _SCENE_CELL_M: Final = 0.04
 _SCENE_AROUND_M: Final = 0.7
 _FLOOR_M: Final = 0.05  # points below are floor
-_PANEL_SPACING_M: Final = 0.08
-_BEYOND_HANDLE_M: Final = 0.08  # a door goes on behind its handle
-_FRONT_HALF_M: Final = 0.2  # half width of a drawer's front; the data does not give it
-_UPRIGHT: Final = 0.9  # cosine: an axis that counts as vertical
 _FAR_M: Final = 0.2  # from the running median: an outlier, for the first guess only
 _APPROACH_S: Final = 0.5
 _SPEED_S: Final = 0.15
 _AROUND: Final = 5  # samples to either side
-
-
-def object_path(demonstration: Demonstration) -> Float[np.ndarray, "t 4 4"]:
-    """The object's poses at all samples: where they are not known, on the articulation, q interpolated."""
-    d = demonstration
-    T, known = d.object.T_world_x.copy(), d.object.known
-    if not known.any():
-        raise InfeasibleError(f"demonstration of {d.task!r}: the object's pose is not known at any sample")
-    if not known.all():
-        q = d.articulation.position(T[known])
-        T[~known] = d.articulation.pose(np.interp(d.times_s[~known], d.times_s[known], q))
-    return T
 
 
 def hand_targets(
@@ -87,42 +70,6 @@ def base_targets(
     return target, M @ covariance @ np.swapaxes(M, 1, 2)
 
 
-def panel_path(demonstration: Demonstration, T_object: Float[np.ndarray, "t 4 4"]) -> Float[np.ndarray, "t m 2"]:
-    """Points of the moving part from above, for the base to keep clear of: those that were seen, thinned out.
-
-    Where none were seen: of a door about an upright axis, a thin plate from the axis to a little beyond the handle; of
-    a part that slides out (drawer), a front of 40 cm; of others nothing.
-    """
-    if len(demonstration.part):
-        return _seen_panel(demonstration, T_object)
-    a, t = demonstration.articulation, len(T_object)
-    out = T_object[:, :3, 0]
-    front = T_object[:, :3, 3] - demonstration.handle.standoff_m * out
-    along = np.column_stack([-out[:, 1], out[:, 0]])  # level, in the front
-    if a.kind == REVOLUTE and abs(a.direction[2]) > _UPRIGHT:
-        axis = a.point[:2]
-        way = front[:, :2] - axis
-        length = np.linalg.norm(way, axis=1, keepdims=True)
-        end = 1 + _BEYOND_HANDLE_M / np.maximum(length, 1e-6)
-        n = max(2, int(np.ceil(length.max() / _PANEL_SPACING_M)) + 1)
-        shares = np.linspace(0, 1, n)[None, :, None] * end[:, None]
-        return axis + shares * way[:, None]
-    if a.kind == PRISMATIC and abs(float(a.direction @ out[0])) > np.sqrt(0.5):
-        n = int(np.ceil(2 * _FRONT_HALF_M / _PANEL_SPACING_M)) + 1
-        places = np.linspace(-_FRONT_HALF_M, _FRONT_HALF_M, n)
-        return front[:, None, :2] + places[None, :, None] * along[:, None]
-    return np.full((t, 1, 2), np.nan)
-
-
-def _seen_panel(demonstration: Demonstration, T_object: Float[np.ndarray, "t 4 4"]) -> Float[np.ndarray, "t m 2"]:
-    """One point per cell of a grid, seen from above with the part at rest."""
-    part = demonstration.part.astype(np.float64)
-    rest = part @ demonstration.articulation.T_rest[:2, :3].T
-    _, first = np.unique(np.round(rest / _PANEL_SPACING_M), axis=0, return_index=True)
-    R, p = T_object[:, :2, :3], T_object[:, None, :2, 3]
-    return p + part[first] @ np.swapaxes(R, 1, 2)
-
-
 def scene_field(demonstration: Demonstration) -> DistanceField | None:
     """Distances to the scene's points around where the hand goes; None without points."""
     hand = demonstration.hand
@@ -159,7 +106,8 @@ def stacked(
     obstacles: Obstacles,
 ) -> Problem:
     """The problem of all demonstrations of one task, one after the other."""
-    hands = [hand_targets(d, calibration.T_hand_tool) for d in demonstrations]
+    hands = [hand_targets(d, calibration.hand_tool(d.acting)) for d in demonstrations]
+    mirrored = mirrored_sides(demonstrations)
     bases = [base_targets(d, calibration.torso_base) for d in demonstrations]
     objects = [object_path(d) for d in demonstrations]
     panels = [panel_path(d, T) for d, T in zip(demonstrations, objects, strict=True)]
@@ -180,9 +128,10 @@ def stacked(
         grasp=grasp,
         panel=np.concatenate(panels),
         surroundings=tuple(
-            Surroundings(s, *maps, scene)
-            for s, maps, scene in zip(steps, obstacles.maps, obstacles.scenes, strict=True)
+            Surroundings(s, d.map, *maps, scene)
+            for s, d, maps, scene in zip(steps, demonstrations, obstacles.maps, obstacles.scenes, strict=True)
         ),
+        mirrored=np.repeat(mirrored, [len(d) for d in demonstrations]),
     )
 
 
@@ -228,9 +177,10 @@ def first_gripper(problem: Problem, grasp: Float[np.ndarray, "4 4"]) -> Float[np
     gaps bridged.
     """
     T = np.empty_like(problem.hand)
+    held = problem.object @ problem.grasps(grasp, np.arange(len(T)))[0]
     for s in problem.surroundings:
         hold = problem.holding[s.steps]
-        part = np.where(hold[:, None, None], problem.object[s.steps] @ grasp, problem.hand[s.steps])
+        part = np.where(hold[:, None, None], held[s.steps], problem.hand[s.steps])
         good: Bool[np.ndarray, " t"] = np.asarray(np.isfinite(part).all(axis=(1, 2)))
         good[good] = hold[good] | _near_median(part[good, :3, 3])
         T[s.steps] = bridged(part, good)

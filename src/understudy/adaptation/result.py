@@ -26,6 +26,8 @@ class Adapted:
     """exact inverse kinematics has a solution"""
     collision_free: Bool[np.ndarray, " t"]
     """the footprint is exactly clear of the map"""
+    grasp: Float[np.ndarray, "4 4"]
+    """T_object_tool: that of the result, or its mirror image for a door that is hung on the other side"""
     energies: dict[str, Float[np.ndarray, " t"]]
     """cost of each kind of edge at each sample: what was bent, and why"""
 
@@ -49,6 +51,6 @@ class AdaptationResult:
     robot: str
     demonstrations: tuple[Adapted, ...]
     grasp: Float[np.ndarray, "4 4"]
-    """T_object_tool: the chosen feasible grasp"""
+    """T_object_tool: the chosen feasible grasp, for the side of the first demonstration"""
     calibration: Calibration
     report: Report

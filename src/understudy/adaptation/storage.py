@@ -21,8 +21,8 @@ from understudy.files import read_json, write_atomically
 from understudy.geometry import is_rigid
 
 FILE: Final = "adaptation.json"
-FORMAT: Final = 1
-_ARRAYS: Final = ("times_s", "T_world_tool", "base", "torso", "achievable", "collision_free")
+FORMAT: Final = 2
+_ARRAYS: Final = ("times_s", "T_world_tool", "base", "torso", "achievable", "collision_free", "grasp")
 _ENERGY: Final = "energy:"
 
 
@@ -43,6 +43,7 @@ def save(folder: Path, result: AdaptationResult, metrics: Mapping[str, Metrics] 
         "demonstrations": len(result.demonstrations),
         "T_object_tool": result.grasp.tolist(),
         "T_hand_tool": result.calibration.T_hand_tool.tolist(),
+        "T_left_tool": None if result.calibration.T_left_tool is None else result.calibration.T_left_tool.tolist(),
         "torso_base": result.calibration.torso_base.tolist(),
         "rounds": result.report.rounds,
         "notes": list(result.report.notes),
@@ -63,7 +64,8 @@ def load(folder: Path) -> AdaptationResult:
     if data.get("format") != FORMAT:
         raise RecordingError(f"{path}: format: must be {FORMAT}, got {data.get('format')!r}")
     try:
-        calibration = Calibration(_rigid(data, "T_hand_tool", path), _array(data, "torso_base", (3,), path))
+        left = None if data["T_left_tool"] is None else _rigid(data, "T_left_tool", path)
+        calibration = Calibration(_rigid(data, "T_hand_tool", path), _array(data, "torso_base", (3,), path), left)
         iterations = tuple(Iteration(**i) for i in data["iterations"])
         seconds = float(data["seconds"]), float(data["process_seconds"])
         report = Report(
@@ -110,7 +112,7 @@ def _demonstration(path: Path) -> Adapted:
     if missing:
         raise RecordingError(f"{path}: no array {missing[0]!r}")
     t = arrays["times_s"].shape[0] if arrays["times_s"].ndim else 0
-    shapes = {"times_s": (t,), "T_world_tool": (t, 4, 4), "base": (t, 3)}
+    shapes = {"times_s": (t,), "T_world_tool": (t, 4, 4), "base": (t, 3), "grasp": (4, 4)}
     for name in arrays:
         if arrays[name].shape != shapes.get(name, (t,)):
             raise RecordingError(f"{path}: {name}: must have shape {shapes.get(name, (t,))}, got {arrays[name].shape}")

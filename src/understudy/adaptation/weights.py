@@ -46,9 +46,9 @@ class Weights:
 class Margins:
     """Distances kept beyond what is needed, metres."""
 
-    obstacle: float = 0.03
+    obstacle: float = 0.02
     reach: float = 0.01
-    panel: float = 0.03
+    panel: float = 0.015
     speed: float = 0.95
     """share of the velocity and acceleration limits that is used"""
 
