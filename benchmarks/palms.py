@@ -43,7 +43,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("docs/palms"))
-    parser.add_argument("--recordings", nargs="+", default=[recordings.registry.SAMPLE], help="with true palms")
+    parser.add_argument("--recordings", nargs="+", default=["sample"], help="with true palms")
     parser.add_argument("--hands", type=int, default=3072, help="simulated hands; 0: none")
     parser.add_argument("--detector", default="blazepose", help="`recording`: its own keypoints2d.json")
     return parser.parse_args(arguments)

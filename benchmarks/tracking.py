@@ -28,7 +28,6 @@ from understudy.errors import UnderstudyError
 from understudy.metrics.matching import match_people
 from understudy.people_file import FramePeople
 from understudy.recordings.base import Recording
-from understudy.recordings.registry import SAMPLE
 from understudy.skeleton import JOINT, N_JOINTS, rows
 from understudy.tracking import IdentityTracker, LiveTracker, Model, PersonTrack, frame_times, track
 from understudy.tracking.measured import measure
@@ -75,7 +74,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     clips = [exact_clip("exact, 10 Hz", 0, 10.0), exact_clip("exact, 30 Hz, uneven", 1, 30.0, uneven=True)]
     clips += [simulated_clip(chosen.work, name) for name in CLIPS]
     if not chosen.no_sample:
-        clips.insert(0, estimated(chosen.work / "room", recordings.open(SAMPLE), "blazepose", "bundled recording"))
+        clips.insert(0, estimated(chosen.work / "room", recordings.open("sample"), "blazepose", "bundled recording"))
     table, live, worse = [], [], []
     for clip in clips:
         before, after = scores(clip, numbered(clip)), scores(clip, offline(clip))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import mujoco
 import numpy as np
@@ -128,8 +128,9 @@ class Renderer:
         self.close()
 
 
-def open_gl(width: int, height: int) -> mujoco.GLContext:
-    """A GL context for pictures off screen. Raises UnderstudyError that says what to do where there is none.
+def open_gl(width: int, height: int) -> Any:
+    """A `GLContext` of one of MuJoCo's back-ends, for pictures off screen. Raises UnderstudyError that says what to do
+    where there is none.
 
     On Linux it is one of EGL, which needs no display, unless the environment variable MUJOCO_GL says otherwise.
     """

@@ -8,12 +8,12 @@ import numpy as np
 from jaxtyping import Float
 
 from understudy.camera import Camera
+from understudy.floor import find_floor
 from understudy.hand_overlay import PALM_ARROW_M, palm_middle, sure
 from understudy.overlay import Rgb, bone_color, describe, joint_color, person_color
 from understudy.skeleton import BONES, FACE, HAND_BONES, JOINT
 from understudy.types import INFERRED, Person
 from understudy.viewer.cloud import Cloud, near_people, thin
-from understudy.floor import find_floor
 from understudy.viewer.results import Moment
 
 JOINT_RADIUS_M = 0.028
