@@ -31,7 +31,7 @@ demo: $(VENV)/user.stamp
 
 test: $(VENV)/dev.stamp
 	$(BIN)/understudy models fetch
-	$(BIN)/python -m pytest
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile
 
 check: $(VENV)/dev.stamp
 	$(BIN)/ruff check .
