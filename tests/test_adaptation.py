@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from understudy import lie
-from understudy.adaptation import calibration, edges, grasps, metrics, placement, plots, prepare, storage
+from understudy.adaptation import calibration, edges, grasps, metrics, most, placement, plots, prepare, storage
 from understudy.adaptation.adapt import AdaptConfig, adapt
 from understudy.adaptation.calibration import DEFAULT_HAND_TOOL, Calibration
 from understudy.adaptation.errors import InfeasibleError
@@ -375,3 +375,31 @@ def test_convergence_is_reported(room_door: tuple[list[Demonstration], Adaptatio
         assert (np.diff(costs) < 0).all()
     assert sum(convergence.iterations[-1].costs.values()) == pytest.approx(convergence.iterations[-1].cost)
     assert "reach" in convergence.table()
+
+
+def test_what_cannot_be_adapted_together_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All, then each alone, then those of one side together, then a single one."""
+    shown = [replace(scenes.demonstration("swivel_door", seed, samples=40), task=str(seed)) for seed in range(4)]
+    a = shown[0].articulation
+    T = a.T_rest  # the same door, hung on the other side of its handle
+    y, far = T[:3, 1], a.point - T[:3, 3]
+    other = replace(a, direction=-a.direction, point=a.point - 2 * y * (y @ far))
+    shown[0] = replace(shown[0], articulation=other)
+    sides = [most._side(d) for d in shown]
+    assert sides[0] == -sides[1] and sides[1:] == [sides[1]] * 3
+    tried: list[list[str]] = []
+
+    def only_alike(demonstrations: list[Demonstration], *args: object, **options: object) -> AdaptationResult:
+        tried.append([d.task for d in demonstrations])
+        if len({most._side(d) for d in demonstrations}) > 1:
+            raise InfeasibleError("they fight")
+        result = object.__new__(AdaptationResult)
+        object.__setattr__(result, "report", [d.task for d in demonstrations])
+        return result
+
+    monkeypatch.setattr(most, "adapt", only_alike)
+    result, left_out = most.adapt_most(shown, scenes.platform())
+    larger = max((1, -1), key=sides.count)
+    assert result.report == [d.task for d, side in zip(shown, sides, strict=True) if side == larger]
+    assert left_out.keys() == {i for i, side in enumerate(sides) if side != larger}
+    assert [len(t) for t in tried] == [4, 1, 1, 1, 1, sides.count(larger)]

@@ -225,7 +225,7 @@ def test_what_the_robot_cannot_do_is_left_out(tmp_path: Path, monkeypatch: pytes
             raise InfeasibleError("too high")
         return teaching_scenes.as_if_adapted(demonstrations)
 
-    monkeypatch.setattr(teaching, "adapt", adapt)
+    monkeypatch.setattr("understudy.adaptation.most.adapt", adapt)
     course = teaching.Course(["a", "b", "c"], tmp_path / "out", "drawer", "pr2", TeachConfig(), False)
     used = [Seen(name, name) for name in "abc"]
     result, left_out = course.feasible(used, shown)

@@ -26,9 +26,9 @@ from tqdm import tqdm
 
 import understudy
 from understudy import methods
-from understudy.adaptation.adapt import AdaptConfig, adapt
-from understudy.adaptation.errors import InfeasibleError
+from understudy.adaptation.adapt import AdaptConfig
 from understudy.adaptation.metrics import Metrics
+from understudy.adaptation.most import adapt_most
 from understudy.adaptation.result import AdaptationResult
 from understudy.demonstration.build import DemonstrationConfig
 from understudy.demonstration.demonstration import Demonstration
@@ -222,27 +222,14 @@ class Course:
         return seen, kept, *load_adaptation(folder)
 
     def feasible(self, used: Sequence[Seen], shown: Sequence[Demonstration]) -> tuple[AdaptationResult, dict[str, str]]:
-        """The adaptation, and demonstrations (name, reason) that were left out for it.
-
-        Only when all cannot be adapted together, each is tried alone.
-        """
-        pairs, settings = list(zip(used, shown, strict=True)), self.config.adaptation
+        """The adaptation, and demonstrations (name, reason) that were left out for it."""
+        pairs = list(zip(used, shown, strict=True))
         left_out = {s.name: why for s, d in pairs if (why := too_short(d))}
         if len(left_out) == len(pairs):
             raise UnderstudyError(f"teach: nothing can be learnt: {'; '.join(left_out.values())}")
-        try:
-            return adapt([d for s, d in pairs if s.name not in left_out], self.platform, config=settings), left_out
-        except InfeasibleError:
-            short = len(left_out)
-            for s, d in pairs:
-                try:
-                    if s.name not in left_out:
-                        adapt([d], self.platform, config=settings)
-                except InfeasibleError as e:
-                    left_out[s.name] = str(e)
-            if len(left_out) in (short, len(pairs)):
-                raise
-        return adapt([d for s, d in pairs if s.name not in left_out], self.platform, config=settings), left_out
+        long = [(s.name, d) for s, d in pairs if s.name not in left_out]
+        result, refused = adapt_most([d for _, d in long], self.platform, config=self.config.adaptation)
+        return result, left_out | {long[i][0]: why for i, why in refused.items()}
 
     def learn(
         self, demonstrations: Sequence[Demonstration], adaptation: AdaptationResult

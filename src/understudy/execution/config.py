@@ -47,4 +47,4 @@ class Config:
     back_m: float = 0.7
     """that the base goes back before another attempt"""
     back_speed: float = 0.25
-    longest_s: float = 60.0
+    longest_s: float = 120.0
