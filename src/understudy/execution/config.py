@@ -19,9 +19,9 @@ class Config:
     """between measurements of the handle"""
     settle_s: float = 0.6
     """before the handle, to measure it; and after the fingers closed"""
-    slow_m: float = 0.012
+    slow_m: float = 0.02
     """of lag behind the plan: the plan is run slower ..."""
-    stop_m: float = 0.03
+    stop_m: float = 0.07
     """... and stands still"""
     patience_s: float = 1.0
     """that it stands still until the part counts as blocked"""
