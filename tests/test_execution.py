@@ -98,7 +98,7 @@ def test_says_that_the_part_is_blocked(drawer: ActionModel, robot: Robot, platfo
     assert not outcome.success and outcome.reason in (Reason.BLOCKED, Reason.LOST), outcome.course
     assert outcome.retries == 1 and abs(outcome.opened_share) < 0.05
     assert outcome.max_force < Config().force_n + 50
-    assert any("does not move" in line for line in outcome.course)
+    assert any("does not move" in line for line in outcome.course), outcome.course
 
 
 def test_notices_that_the_handle_slips(drawer: ActionModel, robot: Robot, platform: Platform) -> None:

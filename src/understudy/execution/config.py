@@ -19,10 +19,14 @@ class Config:
     """between measurements of the handle"""
     settle_s: float = 0.6
     """before the handle, to measure it; and after the fingers closed"""
-    slow_m: float = 0.02
+    slow_m: float = 0.012
     """of lag behind the plan: the plan is run slower ..."""
-    stop_m: float = 0.07
+    stop_m: float = 0.03
     """... and stands still"""
+    sticking_m: float = 0.07
+    """the same once the part has moved: dry friction then holds it for a while, until the arm has pulled enough"""
+    moved_m: float = 0.01
+    """way after which a part has moved"""
     patience_s: float = 1.0
     """that it stands still until the part counts as blocked"""
     at_end: float = 0.9

@@ -186,7 +186,8 @@ class _Run:
         while t < plan.release_s:
             x, v = plan.timed.at(np.array([t]))
             lag = per * abs(float(x[0, -1]) - handle.q)
-            wanted = float(np.clip((c.stop_m - lag) / (c.stop_m - c.slow_m), 0, 1))
+            most = c.sticking_m if per * abs(handle.q - q_from) > c.moved_m else c.stop_m
+            wanted = float(np.clip((most - lag) / (most - c.slow_m), 0, 1))
             rate += float(np.clip(wanted - rate, -8 * TICK_S, 2 * TICK_S))
             waited = waited + TICK_S if rate < 0.05 else 0.0
             if waited > c.patience_s and handle.q - q_from >= c.at_end * (plan.q_goal - q_from):
