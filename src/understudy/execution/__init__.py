@@ -5,12 +5,12 @@ Everything is imported when it is first asked for: it needs the extras `robot` a
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from understudy.execution.outcome import Outcome as Outcome
 from understudy.execution.outcome import Reason as Reason
 from understudy.execution.outcome import Trajectory as Trajectory
+from understudy.late import late_names
 
 if TYPE_CHECKING:
     from understudy.execution.config import Config as Config
@@ -30,15 +30,4 @@ _NEEDED = ("numba", "pinocchio", "mujoco")
 
 __all__ = ["Config", "Execution", "Observed", "Outcome", "Plan", "Reason", "Trajectory", "make_plan"]
 
-
-def __getattr__(name: str) -> Any:
-    if name not in _LATE:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    try:
-        return getattr(import_module(f"{__name__}.{_LATE[name]}"), name)
-    except ModuleNotFoundError as e:
-        from understudy.errors import MissingExtraError
-
-        if e.name in _NEEDED:
-            raise MissingExtraError("executing skills", "robot") from e
-        raise
+__getattr__ = late_names(__name__, _LATE, _NEEDED, "executing skills", "robot")

@@ -5,9 +5,9 @@ Everything is imported when it is first asked for: `import understudy.robot` nee
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+from understudy.late import late_names
 from understudy.robot.description import (
     ROBOTS,
     Gripper,
@@ -67,15 +67,4 @@ __all__ = [
     "urdf_with_base",
 ]
 
-
-def __getattr__(name: str) -> Any:
-    if name not in _LATE:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    try:
-        return getattr(import_module(f"{__name__}.{_LATE[name]}"), name)
-    except ModuleNotFoundError as e:
-        from understudy.errors import MissingExtraError
-
-        if e.name in _NEEDED:
-            raise MissingExtraError("robots", "robot") from e
-        raise
+__getattr__ = late_names(__name__, _LATE, _NEEDED, "robots", "robot")
