@@ -17,6 +17,7 @@ from jaxtyping import Float, Int
 
 from understudy.adaptation.graph import Surroundings
 from understudy.adaptation.placement import Search
+from understudy.lie import wrapped
 
 _EVERY_S: Final = 0.5  # between moments, on the demonstration's clock
 _MOST: Final = 22  # moments; a longer demonstration has them farther apart
@@ -87,11 +88,7 @@ def _moments(search: Search, around: Surroundings) -> Int[np.ndarray, " m"]:
 def _offset(flat: Float[np.ndarray, "n 3"], wanted: Float[np.ndarray, "3"]) -> Float[np.ndarray, " n"]:
     """Cost of being elsewhere than the teacher."""
     away = np.sum((flat[:, :2] - wanted[:2]) ** 2, axis=1) / _FAR_M**2
-    return away + (_turned(flat[:, 2] - wanted[2]) / _FAR_TURN) ** 2
-
-
-def _turned(angle: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    return np.asarray((angle + np.pi) % (2 * np.pi) - np.pi)
+    return away + (wrapped(flat[:, 2] - wanted[2]) / _FAR_TURN) ** 2
 
 
 def _costs(
@@ -104,7 +101,7 @@ def _costs(
     """Of reach and obstacles; only poses that are free and near enough to the teacher's are looked at closely."""
     out = np.full(len(flat), 2 * _WORST)
     near = (np.linalg.norm(flat[:, :2] - wanted[:2], axis=1) < _CLOSER[0]) & (blocked < _WORST)
-    near &= np.abs(_turned(flat[:, 2] - wanted[2])) < _CLOSER[1]
+    near &= np.abs(wrapped(flat[:, 2] - wanted[2])) < _CLOSER[1]
     rows = np.flatnonzero(near)
     out[rows] = blocked[rows] + search.reach_and_panel(np.array([int(step)]), flat[None, rows])[0]
     return out

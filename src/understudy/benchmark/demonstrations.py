@@ -20,6 +20,7 @@ from understudy.demonstration.demonstration import Demonstration
 from understudy.demonstration.segments import MOVING
 from understudy.errors import UnderstudyError
 from understudy.geometry import angle_between, inverse
+from understudy.lie import wrapped
 from understudy.objects.articulation import PRISMATIC, REVOLUTE, Articulation
 from understudy.skeleton import JOINT
 from understudy.trajectories import PoseTrack
@@ -131,7 +132,7 @@ def score(demo: Demonstration, truth: TrueDemonstration) -> DemonstrationErrors:
     counts = visible & demo.hand.observed & np.isfinite(shift).all(axis=1)
     planar = _planar(demo.T_world_cam @ torso)
     apart = demo.torso.xy_yaw - planar
-    heading = np.abs((apart[:, 2] + np.pi) % (2 * np.pi) - np.pi)
+    heading = np.abs(wrapped(apart[:, 2]))
     there = np.isfinite(apart).all(axis=1)
     own_object = T_cam_world @ demo.object.T_world_x
     known = demo.object.known

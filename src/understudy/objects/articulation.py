@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from understudy.errors import UnderstudyError, one_of
 from understudy.geometry import inverse, is_rigid, transform_points
+from understudy.lie import wrapped
 
 FIXED, PRISMATIC, REVOLUTE = KINDS = ("fixed", "prismatic", "revolute")
 """Kinds of articulation."""
@@ -93,7 +94,7 @@ class Articulation:
         # the nearest rotation about the axis: swing-twist of R, which does not care where the axis is ...
         turn = Rotation.from_matrix(T[:, :3, :3] @ self.T_rest[:3, :3].T).as_quat()
         angle = 2 * np.arctan2(turn[:, :3] @ self.direction, turn[:, 3])
-        return np.asarray((angle + np.pi) % (2 * np.pi) - np.pi)
+        return wrapped(angle)
 
     def moved(self, T_new_old: Float[np.ndarray, "4 4"]) -> Articulation:
         """The same in another frame."""

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from understudy.errors import UnderstudyError
+from understudy.lie import hat
 from understudy.objects.articulation import FIXED, PRISMATIC, REVOLUTE, Articulation
 
 _STEPS: Final = 4  # of Gauss-Newton for q; started from the closed form, two reach the last digit
@@ -101,7 +102,7 @@ class Hypotheses:
 
 def tangents(direction: Float[np.ndarray, "*b 3"]) -> Float[np.ndarray, "*b 3 2"]:
     """Two unit vectors across a unit vector, and across each other."""
-    K = _skew(direction)
+    K = hat(direction)
     least = np.abs(direction).argmin(axis=-1)[..., None, None]
     first = np.take_along_axis(K, least, axis=-1)  # direction x that axis
     first = first / np.sqrt((first**2).sum(axis=-2, keepdims=True))
@@ -119,7 +120,7 @@ def _turns(h: Hypotheses, q: np.ndarray) -> np.ndarray:
     """Rotations (*b, n, 3, 3) from the rest pose, by Rodrigues' formula: the axis is one for all."""
     if h.kind != REVOLUTE:
         return np.broadcast_to(np.eye(3), (*q.shape, 3, 3))
-    K = _skew(h.direction)[..., None, :, :]
+    K = hat(h.direction)[..., None, :, :]
     return np.asarray(np.eye(3) + np.sin(q)[..., None, None] * K + (1 - np.cos(q))[..., None, None] * (K @ K))
 
 
@@ -144,7 +145,7 @@ def _log(R: np.ndarray) -> np.ndarray:
 def _exp(v: np.ndarray) -> np.ndarray:
     """Rotations (*b, 3, 3) of rotation vectors (*b, 3)."""
     angle = np.sqrt((v**2).sum(axis=-1))[..., None, None]
-    K = _skew(v)
+    K = hat(v)
     return np.asarray(np.eye(3) + np.sinc(angle / np.pi) * K + np.sinc(angle / (2 * np.pi)) ** 2 / 2 * (K @ K))
 
 
@@ -160,7 +161,7 @@ def slope(h: Hypotheses, q: Float[np.ndarray, "*b n"]) -> Float[np.ndarray, "*b 
         out[..., :3] = h.direction[..., None, :]
     elif h.kind == REVOLUTE:
         arm = _origins(h, q, _turns(h, q)) - h.point[..., None, :]
-        out[..., :3] = arm @ _skew(h.direction).swapaxes(-1, -2)
+        out[..., :3] = arm @ hat(h.direction).swapaxes(-1, -2)
         out[..., 3:] = h.direction[..., None, :]
     return out
 
@@ -175,12 +176,12 @@ def derivatives(
         motion[..., :3, :3] = motion[..., 3:, 3:6] = E
         tilt = (np.eye(3) - E) @ tangents(h.direction)[..., None, :, :]
         arm = _origins(h, q, E) - h.point[..., None, :]
-        motion[..., :3, 6:8] = -_skew(arm) @ tilt
+        motion[..., :3, 6:8] = -hat(arm) @ tilt
         motion[..., 3:, 6:8] = motion[..., :3, 8:10] = tilt
     else:
         motion[..., :6] = np.eye(6)
         if h.kind == PRISMATIC:
-            way = _skew(h.direction) @ tangents(h.direction)
+            way = hat(h.direction) @ tangents(h.direction)
             motion[..., :3, 6:8] = -q[..., None, None] * way[..., None, :, :]
     motion[..., 3:, :] = _seen(e) @ motion[..., 3:, :]
     return -motion
@@ -190,15 +191,9 @@ def _seen(e: np.ndarray) -> np.ndarray:
     """The change of Log(R_measured R') when R turns by a small rotation on its left: the inverse right Jacobian."""
     angle = np.sqrt((e[..., 3:] ** 2).sum(axis=-1))
     angle = np.clip(angle, 1e-3, 3.0)  # below: the series' next term is 1e-9; above: an outlier
-    K = _skew(e[..., 3:])
+    K = hat(e[..., 3:])
     factor = 1 / angle**2 - (1 + np.cos(angle)) / (2 * angle * np.sin(angle))
     return np.asarray(np.eye(3) + K / 2 + factor[..., None, None] * (K @ K))
-
-
-def _skew(v: np.ndarray) -> np.ndarray:
-    K = np.zeros((*v.shape, 3))
-    K[..., 2, 1], K[..., 0, 2], K[..., 1, 0] = v[..., 0], v[..., 1], v[..., 2]
-    return K - K.swapaxes(-1, -2)
 
 
 def stepped(h: Hypotheses, delta: np.ndarray) -> Hypotheses:

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d, minimum_filter1d
 
+from understudy.lie import wrapped
 from understudy.objects.articulation import PRISMATIC
 from understudy.stage.body import SIDES, Skeleton
 from understudy.stage.furniture import Furniture
@@ -120,7 +121,7 @@ class Motion:
         eyes = float(self.skeleton.face[1, 2])
         way = handle - np.column_stack([v[:, :2], np.full(len(v), eyes)])
         turn = np.arctan2(way[:, 1], way[:, 0]) - v[:, 2] - v[:, 5]
-        turn = np.clip((turn + np.pi) % (2 * np.pi) - np.pi, -1.0, 1.0)
+        turn = np.clip(wrapped(turn), -1.0, 1.0)
         nod = np.clip(np.arctan2(-way[:, 2], np.hypot(way[:, 0], way[:, 1])) - v[:, 3], -0.4, 0.55)
         looks = 1 - ramp(times, self.clock.release + 0.1, self.clock.release + 0.7)
         around = 0.25 * np.sin(1.3 * times + self.sway[0])

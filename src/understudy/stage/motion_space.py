@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.ndimage import gaussian_filter1d
 
+from understudy.lie import wrapped
 from understudy.stage.furniture import Box, Furniture
 
 DT: Final = 0.2
@@ -120,7 +121,7 @@ def _discomfort(cells: Float[np.ndarray, "a b 2"], hand: Float[np.ndarray, "3"])
     way = hand[:2] - cells
     distance = np.linalg.norm(way, axis=-1)
     turn = np.arctan2(way[..., 1], way[..., 0]) - hand[2]
-    turn = np.abs((turn + np.pi) % (2 * np.pi) - np.pi)
+    turn = np.abs(wrapped(turn))
     far = ((distance - _HANDLE_WAY) / 0.10) ** 2
     return np.minimum(far, 40.0) + np.clip(turn - 0.5, 0, None) ** 2 * 6.0
 
