@@ -11,11 +11,13 @@ import pytest
 for name in ("mujoco", "pinocchio", "numba", "sklearn"):
     pytest.importorskip(name, reason="needs the extras robot and stage, and scikit-learn")
 
+import adaptation_scenes  # noqa: E402
 import execution_scenes as scenes  # noqa: E402
 from scipy.stats import binomtest  # noqa: E402
 
 from understudy import lie  # noqa: E402
-from understudy.actions import ActionModel, RobotPose, Skill  # noqa: E402
+from understudy.actions import ActionModel, RobotPose, Skill, learn  # noqa: E402
+from understudy.adaptation.adapt import adapt  # noqa: E402
 from understudy.adaptation.fields import collision_free  # noqa: E402
 from understudy.adaptation.platform import Platform  # noqa: E402
 from understudy.demonstration.demonstration import OCCUPIED  # noqa: E402
@@ -23,13 +25,16 @@ from understudy.errors import MissingExtraError, UnderstudyError  # noqa: E402
 from understudy.execution import trials  # noqa: E402
 from understudy.execution.control import Arm, HandleEstimate  # noqa: E402
 from understudy.execution.execution import Config, Execution  # noqa: E402
+from understudy.execution.imitation import imitation_plan, unadapted  # noqa: E402
 from understudy.execution.outcome import Outcome, Reason, Stopped  # noqa: E402
 from understudy.execution.planning import make_plan  # noqa: E402
 from understudy.execution.surroundings import observe  # noqa: E402
 from understudy.execution.timing import time_scaled  # noqa: E402
+from understudy.geometry import inverse  # noqa: E402
 from understudy.robot.model import Robot  # noqa: E402
-from understudy.robot.simulator import Simulator  # noqa: E402
+from understudy.robot.simulator import Noise, Simulator  # noqa: E402
 from understudy.stage.furniture import sample_furniture  # noqa: E402
+from understudy.teaching_motions import robot_motions  # noqa: E402
 
 
 @pytest.fixture(scope="module")
@@ -182,6 +187,50 @@ def test_handle_estimate_finds_a_wrong_articulation() -> None:
         estimate.add(truth.pose(np.array([q]))[0] @ noise)
         errors.append(np.linalg.norm((estimate.pose(estimate.q) - truth.pose(np.array([q]))[0])[:3, 3]))
     assert np.sqrt(np.mean(np.square(errors[30:]))) < 0.004
+
+
+def test_the_correction_on_the_floor_does_the_same_to_the_handle() -> None:
+    truth = sample_furniture("room_door", 4).articulation
+    away = lie.se3_exp(np.array([0.03, -0.02, 0.01, 0.0, 0.0, 0.05]))
+    estimate, q = HandleEstimate(truth.moved(inverse(away))), np.array([0.3])
+    estimate.add(truth.pose(q)[0], 0.3)
+    moved = lie.se2_to_se3(estimate.correction_on_floor(0.3)[None])[0]
+    assumed, there = truth.moved(inverse(away)).pose(q)[0], truth.pose(q)[0]
+    np.testing.assert_allclose((moved @ assumed)[:2], there[:2], atol=1e-9)
+
+
+def test_the_base_stands_as_planned_before_the_handle_however_wrong_the_place_was(
+    drawer: ActionModel, robot: Robot, platform: Platform
+) -> None:
+    """The robot is wrong by up to 8 cm and 6 degrees from afar: seen from the true handle, base and plan agree."""
+    setup = trials.TrialSetup("drawer", 100_002)
+    stands = []
+    for noise in (Noise((0, 0), (0, 0), (0, 0)), Noise((0.08, 6.0), (0, 0), (0, 0))):
+        simulator = Simulator(robot, setup.furniture, seed=3, base_start=setup.base_start, noise=noise)
+        perception = partial(observe, setup.furniture)
+        outcome = Execution(drawer, robot, platform, perception).run(simulator)
+        assert outcome.success, outcome.course
+        t = outcome.trajectory
+        begins = int(np.argmax(t.opened > 0.02))
+        stands.append(t.base[begins])
+    planned, corrected = stands
+    # the plan itself differs a little, as it begins elsewhere
+    assert np.linalg.norm(planned[:2] - corrected[:2]) < 0.03 and abs(planned[2] - corrected[2]) < 0.03
+    assert np.abs(t.base[:, 2] - setup.base_start[2]).max() < np.pi / 2  # it does not turn all the way round
+
+
+def test_imitation_follows_hand_and_torso_as_they_were(robot: Robot, platform: Platform) -> None:
+    shown = [adaptation_scenes.demonstration("drawer", k) for k in range(2)]
+    result = adapt(shown, platform)
+    raw = unadapted(shown, result, platform)
+    for d, a in zip(shown, raw.demonstrations, strict=True):
+        seen = d.hand.observed
+        expected = d.hand.T_world_x[seen] @ result.calibration.hand_tool(d.acting)
+        np.testing.assert_allclose(a.T_world_tool[seen], expected, atol=1e-9)
+    skill = learn(robot_motions(shown, raw))
+    setup = trials.TrialSetup("drawer", 100_000)
+    imitated = trials.run_trial(skill, robot, platform, setup, planner=imitation_plan)
+    assert imitated.reason in set(Reason) and imitated.trajectory.times_s[-1] > 1
 
 
 def test_arm_follows_a_tool_path_exactly(robot: Robot) -> None:

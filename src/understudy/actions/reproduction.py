@@ -38,7 +38,7 @@ class Reproduction:
     """from 0, evenly spaced"""
     T_world_tool: Float[np.ndarray, "t 4 4"]
     xy_yaw: Float[np.ndarray, "t 3"]
-    """of the base: metres, metres, radians (unwrapped)"""
+    """of the base: metres, metres, radians (unwrapped; within half a turn of the start, or of 0, at first)"""
     torso_height: Float[np.ndarray, " t"]
     """metres; the robot's limits are not the model's business"""
     covariance: Float[np.ndarray, "t 10 10"]
@@ -80,6 +80,8 @@ def reproduce(model: ActionModel, thing: ObjectMotion, rate_hz: float, start: Ro
         qs.append(q)
     T_world_tool, xy_yaw, torso = (np.concatenate(part) for part in zip(*parts, strict=True))
     xy_yaw[:, 2] = np.unwrap(xy_yaw[:, 2])
+    turned = xy_yaw[0, 2] - (0.0 if start is None else start.xy_yaw[2])
+    xy_yaw[:, 2] -= 2 * np.pi * np.round(turned / (2 * np.pi))  # a base does not turn all the way round to begin
     q = np.concatenate(qs)
     return Reproduction(
         np.arange(sum(steps) + 1) / rate_hz,

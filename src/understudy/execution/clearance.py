@@ -15,14 +15,14 @@ from scipy.spatial import cKDTree
 from understudy import lie
 from understudy.adaptation.fields import DistanceField, point_field
 from understudy.execution.surroundings import Observed
-from understudy.robot.chain import frames
+from understudy.robot.arm_surface import arm_surface
 from understudy.robot.ik import embed
 from understudy.robot.model import Robot
 
 _CELL_M: Final = 0.025
-_UPPER_M, _LOWER_M, _GRIPPER_M = 0.10, 0.075, 0.05  # radii of upper arm, forearm, palm, with a little to spare
-_FROM: Final = 0.25  # share of the upper arm, from the shoulder, that cannot be elsewhere
-_SPARE_M: Final = 0.01
+_LEAST_M: Final = 0.0  # of the links' surfaces to a cell in which something is: to that itself, it is half a cell more
+_HAND_M: Final = np.array([0.07, 0.12])  # behind the tool: middles of balls that cover palm and wrist ...
+_HAND_RADIUS_M: Final = 0.04  # ... to such a cell
 
 
 class Around:
@@ -80,42 +80,21 @@ class GuardedRobot(Robot):
     def _clear(
         self, q: Float[np.ndarray, "n j"], torso: Float[np.ndarray, " n"], sample: np.ndarray
     ) -> Bool[np.ndarray, " n"]:
-        upper, lower, gripper = self._points(q, torso)
-        arm = ((upper, _UPPER_M), (lower, _LOWER_M))
-        clear = np.ones(len(q), bool)
-        for field, T, parts in (
-            (self._around.scene, self._T_world_base[sample], (*arm, (gripper, _GRIPPER_M))),
-            (self._around.part, self._T_object_base[sample], arm),
-        ):
-            if field is None:
-                continue
-            for points, radius in parts:
-                there = points @ np.swapaxes(T[:, :3, :3], 1, 2) + T[:, None, :3, 3]
-                distance = field.at(there.reshape(-1, 3))[0].reshape(len(q), -1)
-                clear &= distance.min(axis=1) > radius
+        x, clear = self._robot.stack(q, torso), np.ones(len(q), bool)
+        surface, around = arm_surface(self._robot), self._around
+        for field, T in ((around.scene, self._T_world_base[sample]), (around.part, self._T_object_base[sample])):
+            if field is not None:
+                clear &= surface.clear(x, T, field.values, field.origin, field.cell_m, _LEAST_M)
+        if around.scene is not None:
+            T_world_tool = self._T_world_base[sample] @ self._robot.forward(q, torso)
+            hand = T_world_tool[:, None, :3, 3] - _HAND_M[:, None] * T_world_tool[:, None, :3, 0]
+            near = around.scene.at(hand.reshape(-1, 3))[0].reshape(len(q), -1)
+            clear &= near.min(axis=1) > _HAND_RADIUS_M
         return clear
-
-    def _points(self, q: np.ndarray, torso: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Points along upper arm, forearm, palm and wrist; base frame."""
-        x, fixed = self._robot.stack(q, torso), self._robot.fixed
-        work, tmp = np.empty((x.shape[1] + 1, 3, 4)), np.empty((3, 4))
-        joints = np.empty((len(x), x.shape[1] + 1, 3))
-        axis = np.empty((len(x), 3))
-        for i, row in enumerate(x):
-            frames(fixed, row, work, tmp)
-            joints[i], axis[i] = work[:, :, 3], work[-1, :, 0]
-        # the farthest of the joints from the shoulder on are elbow and wrist, wherever the description puts them
-        shoulder, elbow, wrist = joints[:, 2], joints[:, 4], joints[:, -3]
-        upper = [shoulder + u * (elbow - shoulder) for u in (_FROM, 0.7, 1.0)]
-        lower = [elbow + u * (wrist - elbow) for u in (0.3, 0.6, 1.0)]
-        hand = [joints[:, -1] - d * axis for d in (0.07, 0.12)]
-        return np.stack(upper, axis=1), np.stack(lower, axis=1), np.stack(hand, axis=1)
 
 
 def _field(points: Float[np.ndarray, "n 3"], low: np.ndarray, high: np.ndarray) -> DistanceField | None:
     inside = points[((points > low) & (points < high)).all(axis=1)]
     if not len(inside):
         return None
-    field = point_field(inside, low, high, _CELL_M)
-    # a point fills its cell: on average what is there begins a quarter of a cell nearer than its centre
-    return DistanceField(field.values + _SPARE_M, field.origin, field.cell_m)
+    return point_field(inside, low, high, _CELL_M)

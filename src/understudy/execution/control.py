@@ -70,6 +70,13 @@ class HandleEstimate:
         """T_world_object with the part at q."""
         return np.asarray(self.T_correct @ self._articulation.pose(np.array([q]))[0])
 
+    def correction_on_floor(self, q: float) -> Float[np.ndarray, "3"]:
+        """x, y, yaw of the motion on the floor that does to the handle at q what `T_correct` does; world."""
+        yaw = float(np.arctan2(self.T_correct[1, 0], self.T_correct[0, 0]))
+        assumed = self._articulation.pose(np.array([q]))[0, :2, 3]
+        c, s = np.cos(yaw), np.sin(yaw)
+        return np.append(self.pose(q)[:2, 3] - np.array([[c, -s], [s, c]]) @ assumed, yaw)
+
     def position(self, T_world_object: Float[np.ndarray, "4 4"]) -> float:
         """Where the part is, by one measurement."""
         return float(self._articulation.position((inverse(self.T_correct) @ T_world_object)[None])[0])

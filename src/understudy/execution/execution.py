@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Protocol, runtime_checkable
+from typing import Final, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -22,6 +22,9 @@ from understudy.objects.articulation import REVOLUTE, Articulation
 from understudy.robot.model import Robot
 from understudy.robot.simulator import Simulator, Targets, Touch
 
+_FOLDING: Final = 0.5
+"""share of the arm's velocity limits at which it goes back to its posture"""
+
 
 @runtime_checkable
 class Perception(Protocol):
@@ -31,6 +34,22 @@ class Perception(Protocol):
     """
 
     def __call__(self, T_world_object: Float[np.ndarray, "4 4"], opened: float) -> Observed: ...
+
+
+@runtime_checkable
+class Planner(Protocol):
+    """How a skill becomes a motion: `planning.make_plan`, or a baseline. Raises Stopped(NO_PLAN)."""
+
+    def __call__(
+        self,
+        model: ActionModel,
+        robot: Robot,
+        platform: Platform,
+        observed: Observed,
+        start: RobotPose,
+        q_start: Float[np.ndarray, " j"],
+        q_goal: float | None = None,
+    ) -> Plan: ...
 
 
 class Execution:
@@ -45,9 +64,11 @@ class Execution:
         *,
         q_goal: float | None = None,
         config: Config | None = None,
+        planner: Planner = make_plan,
     ):
         """q_goal: how far to open; None: as far as was demonstrated, or as the object opens."""
         self.model, self.robot, self.platform, self.perception = model, robot, platform, perception
+        self.planner = planner
         self.q_goal, self.config = q_goal, config or Config()
 
     def run(self, simulator: Simulator) -> Outcome:
@@ -69,6 +90,7 @@ class _Run:
         state = simulator.state()
         self.targets = Targets(state.base, state.q, state.torso, state.opening_m)
         self.arm = Arm(self.robot, state.q)
+        self.rested = state.q.copy()
         self.share = 0.0
 
     def outcome(self) -> Outcome:
@@ -117,7 +139,7 @@ class _Run:
         observed = self.execution.perception(self.sim.measured_handle_pose(near=self.retries > 0), known)
         state = self.sim.state()
         start = RobotPose(state.T_world_tool, state.base, state.torso)
-        plan = make_plan(
+        plan = self.execution.planner(
             self.execution.model, self.robot, self.execution.platform, observed, start, self.targets.q, self.goal
         )
         self.planning_s += plan.processor_s
@@ -127,6 +149,7 @@ class _Run:
         self.handle.q = q0
         most = self.robot.description.gripper.opening_m
         self.widest = min(most, 2 * observed.handle.radius_m + self.config.clearance_m)
+        self.moved_by = np.zeros(3)
         self.phase = "reach"
         self.reach(plan)
         self.phase = "approach"
@@ -153,7 +176,9 @@ class _Run:
         ticks = round(c.settle_s / TICK_S)
         for k in range(ticks):
             self.measure(q0)
-            # what the far measurement was wrong by is made up for while the gripper is clear of the handle
+            # what the far measurement was wrong by is made up for while the gripper is clear of the handle, by the base
+            # as well: then all of the robot is as far from door frames and cabinets as was planned
+            self.moved_by = (k + 1) / ticks * handle.correction_on_floor(q0)
             self.follow(plan, plan.approach_s, q0, share=(k + 1) / ticks)
         for t in np.arange(plan.approach_s, plan.grasp_s, TICK_S):
             self.measure(q0)
@@ -233,7 +258,7 @@ class _Run:
         assert self.handle is not None
         q_end = self.handle.q
         held = self.handle.pose(q_end) @ self.pivoted(plan, q_end) @ self.T_object_tool
-        x, _ = plan.timed.at(np.array([plan.release_s]))
+        x, _ = self.planned(plan, plan.release_s)
         while self.opening < widest:
             self.opening = min(widest, max(self.opening, 0.0) + 0.1 * TICK_S)
             self.track(held, x[0])
@@ -247,15 +272,28 @@ class _Run:
     ) -> None:
         """One tick: base and torso as planned, the tool where the handle wants it. q: None: as planned."""
         assert self.handle is not None
-        x, v = plan.timed.at(np.array([t]))
+        x, v = self.planned(plan, t)
         part = float(x[0, -1]) if q is None else q
         if held:
             T = self.handle.pose(part) @ self.pivoted(plan, part) @ self.T_object_tool
         else:
-            planned = lie.se2_to_se3(x[:, :3])[0] @ self.robot.forward(x[:, 4:-1], x[:, 3])[0]
+            x_far = plan.timed.at(np.array([t]))[0]
+            planned = lie.se2_to_se3(x_far[:, :3])[0] @ self.robot.forward(x_far[:, 4:-1], x_far[:, 3])[0]
             T = lie.se3_exp(share * lie.se3_log(self.handle.T_correct)) @ planned @ self.T_given
         self.wanted = T
         self.track(T, x[0], rate * v[0])
+
+    moved_by: Float[np.ndarray, "3"]
+    """of the base's plan, world: x, y, yaw about the origin"""
+
+    def planned(self, plan: Plan, t: float) -> tuple[Float[np.ndarray, "1 k"], Float[np.ndarray, "1 k"]]:
+        """The plan at a moment, and its rates; the base's where the handle turned out to be."""
+        x, v = plan.timed.at(np.array([t]))
+        T = lie.se2_to_se3(self.moved_by[None])[0]
+        x[0, :2] = T[:2, :2] @ x[0, :2] + T[:2, 3]
+        x[0, 2] += self.moved_by[2]
+        v[0, :2] = T[:2, :2] @ v[0, :2]
+        return x, v
 
     def track(
         self,
@@ -351,7 +389,9 @@ class _Run:
         self.drive_back(x)
 
     def drive_back(self, x: Float[np.ndarray, " k"]) -> None:
-        """Away from the furniture, the way that the base came, the arm as it is: from there a plan is free to begin."""
+        """Away from the furniture, the way that the base came, then the arm as it was before the first attempt: from
+        there a plan is free to begin.
+        """
         q = self.targets.q.copy()
         came = [row for row in reversed(self.log.base) if np.linalg.norm(row[:2] - x[:2]) <= self.config.back_m]
         far = np.cumsum([0.0, *np.linalg.norm(np.diff(np.array(came), axis=0)[:, :2], axis=1)])
@@ -360,6 +400,17 @@ class _Run:
         for i, row in enumerate(base):
             velocity = (base[i + 1] - row) / TICK_S if i + 1 < len(base) else np.zeros(3)
             self.send(row, velocity, float(x[3]), 0.0, q, np.zeros(len(q)))
+        self.fold(base[-1] if len(base) else x[:3], float(x[3]))
+
+    def fold(self, base: Float[np.ndarray, "3"], torso: float) -> None:
+        """The arm goes back to where it was at first, the base standing."""
+        q = self.targets.q
+        away = np.where(self.robot.continuous, lie.wrapped(self.rested - q), self.rested - q)
+        seconds = max(1.0, float((2 * np.abs(away) / (_FOLDING * self.robot.velocity)).max()))
+        u = np.linspace(0, 1, round(seconds / TICK_S))
+        course = q + (u**2 * (3 - 2 * u))[:, None] * away
+        for row, rate in zip(course, np.gradient(course, TICK_S, axis=0), strict=True):
+            self.send(base, np.zeros(3), torso, 0.0, row, rate)
 
     def opened_share(self) -> float:
         """True position of the part over the goal."""

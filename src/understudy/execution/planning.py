@@ -29,6 +29,7 @@ from understudy.execution.outcome import Reason, Stopped
 from understudy.execution.surroundings import Observed
 from understudy.execution.timing import Timed, time_scaled
 from understudy.objects.articulation import Articulation
+from understudy.robot.ik_bridge import bridged
 from understudy.robot.ik_path import IKPath, solve_ik_path
 from understudy.robot.model import Robot
 from understudy.trajectories import PlanarTrack, PoseTrack
@@ -95,16 +96,29 @@ def make_plan(
         raise
     except UnderstudyError as e:
         raise Stopped(Reason.NO_PLAN, str(e)) from e
-    times, arrived = motion.times_s, _arrived(task)
-    approach, grasp, release = times[[arrived, task.segments.grasp, task.segments.release]]
-    x = np.column_stack([state.base, path.torso, _from(path, q_start, arrived), motion.q])
-    limits = _velocities(robot), _accelerations(robot)
-    timed = time_scaled(times, x, *limits, stops=np.array([approach, grasp, release]))
-    at = [timed.time_of(s) for s in (approach, grasp, release)]
+    moments = _arrived(task), task.segments.grasp, task.segments.release
+    timed, at = scaled(robot, motion.times_s, state.base, path, q_start, motion.q, moments)
     spent = time.process_time() - began
-    return Plan(
-        timed, at[0], at[1], at[2], graph.problem.grasp, graph.pivot, observed.articulation, float(motion.q[-1]), spent
-    )
+    return Plan(timed, *at, graph.problem.grasp, graph.pivot, observed.articulation, float(motion.q[-1]), spent)
+
+
+def scaled(
+    robot: Robot,
+    times_s: Float[np.ndarray, " t"],
+    base: Float[np.ndarray, "t 3"],
+    path: IKPath,
+    q_start: Float[np.ndarray, " j"],
+    opened: Float[np.ndarray, " t"],
+    moments: tuple[int, int, int],
+) -> tuple[Timed, tuple[float, float, float]]:
+    """A motion of the whole body within the robot's limits, at rest at three samples: before the handle, where it
+    takes hold and where it lets go; and when these are. opened: position of the part.
+    """
+    x = np.column_stack([base, path.torso, _from(path, q_start, moments[0]), opened])
+    stops = times_s[list(moments)]
+    timed = time_scaled(times_s, x, _velocities(robot), _accelerations(robot), stops=stops)
+    approach, grasp, release = (timed.time_of(float(s)) for s in stops)
+    return timed, (approach, grasp, release)
 
 
 def _velocities(robot: Robot) -> Float[np.ndarray, " k"]:
@@ -247,7 +261,7 @@ def _joints(robot: Robot, around: Around, state: State, task: Demonstration, arr
     guarded = np.arange(len(task)) >= _NEAR * arrived
     T_object = prepare.object_path(task)
     guard = GuardedRobot(robot, around, state.base, T_base_tool, T_object, guarded)
-    return solve_ik_path(guard, T_base_tool, state.torso, task.times_s)
+    return bridged(guard, solve_ik_path(guard, T_base_tool, state.torso, task.times_s), T_base_tool)
 
 
 def _widened(failed: Bool[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:

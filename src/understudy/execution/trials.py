@@ -26,8 +26,9 @@ from understudy.adaptation.platform import Platform
 from understudy.demonstration.tasks import TASKS
 from understudy.errors import UnderstudyError, one_of
 from understudy.execution.config import Config
-from understudy.execution.execution import Execution
+from understudy.execution.execution import Execution, Planner
 from understudy.execution.outcome import Outcome
+from understudy.execution.planning import make_plan
 from understudy.execution.surroundings import observe
 from understudy.files import read_json, write_atomically
 from understudy.robot.description import load_description
@@ -108,6 +109,7 @@ def run_trial(
     *,
     video: Path | None = None,
     config: Config | None = None,
+    planner: Planner = make_plan,
 ) -> Outcome:
     """One trial; the same for the same arguments. video: where to write one (needs OpenGL, takes much longer)."""
     furniture = setup.furniture
@@ -115,7 +117,8 @@ def run_trial(
         robot, furniture, seed=setup.seed, base_start=setup.base_start, render=video is not None
     ) as simulator:
         perception = partial(observe, furniture)
-        execution = Execution(model, robot, platform, perception, q_goal=goal(model, furniture), config=config)
+        q_goal = goal(model, furniture)
+        execution = Execution(model, robot, platform, perception, q_goal=q_goal, config=config, planner=planner)
         outcome = execution.run(simulator)
         if video is not None and simulator.video is not None:
             write_video(video, simulator.video.frames)
@@ -131,10 +134,12 @@ def run_trials(
     *,
     videos: str = "none",
     done: Callable[[TrialSetup, dict[str, Any]], None] | None = None,
+    planner: Planner = make_plan,
 ) -> list[dict[str, Any]]:
     """Runs what has not been run yet; one file per trial in `out`, written whole or not at all.
 
-    videos: none, failures or all. Results of another skill in the same folder are refused (UnderstudyError).
+    videos: none, failures or all. planner: see `Execution`. Results of another skill in the same folder are refused
+    (UnderstudyError).
     """
     if videos not in ("none", "failures", "all"):
         raise UnderstudyError(f"videos {videos!r}: must be {one_of(('none', 'failures', 'all'))}")
@@ -144,11 +149,11 @@ def run_trials(
         file = Path(out) / f"{setup.task}-{setup.seed}.json"
         row = _kept(file, name)
         if row is None:
-            row = _run(skill.model, robot, platform, setup, name)
+            row = _run(skill.model, robot, platform, setup, name, planner)
             write_atomically(file, json.dumps(row, indent=2) + "\n")
         film = file.with_suffix(".mp4")
         if (videos == "all" or (videos == "failures" and not row["success"])) and not film.exists():
-            run_trial(skill.model, robot, platform, setup, video=film)  # again: it is the same trial
+            run_trial(skill.model, robot, platform, setup, video=film, planner=planner)  # again: it is the same trial
         rows.append(row)
         if done is not None:
             done(setup, row)
@@ -173,9 +178,11 @@ def _kept(file: Path, skill: str) -> dict[str, Any] | None:
     return row
 
 
-def _run(model: ActionModel, robot: Robot, platform: Platform, setup: TrialSetup, skill: str) -> dict[str, Any]:
+def _run(
+    model: ActionModel, robot: Robot, platform: Platform, setup: TrialSetup, skill: str, planner: Planner
+) -> dict[str, Any]:
     wall, process = time.perf_counter(), time.process_time()
-    outcome = run_trial(model, robot, platform, setup)
+    outcome = run_trial(model, robot, platform, setup, planner=planner)
     return {
         "format": FORMAT,
         "skill": skill,

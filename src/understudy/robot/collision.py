@@ -52,7 +52,7 @@ class SelfCollision:
 
     def check(self, q: Float[np.ndarray, "n j"], torso: Float[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
         """Whether any pair touches, for each configuration."""
-        rows = self._configurations(q, torso)
+        rows = self.configurations(q, torso)
         update, touch = self._pin.updateGeometryPlacements, self._pin.computeCollisions
         out = np.empty(len(rows), bool)
         with self._lock:  # one set of working data for all threads
@@ -63,15 +63,15 @@ class SelfCollision:
 
     def touching(self, q: Float[np.ndarray, " j"], torso: float) -> list[tuple[str, str]]:
         """The pairs of links that touch."""
-        row = self._configurations(q[None], np.array([torso]))[0]
+        row = self.configurations(q[None], np.array([torso]))[0]
         self._pin.updateGeometryPlacements(self.model, self.data, self.geometry, self.geometry_data, row)
         self._pin.computeCollisions(self.geometry, self.geometry_data, False)
         hit = [r.isCollision() for r in self.geometry_data.collisionResults]
         names = [self._links(pair) for pair in self.geometry.collisionPairs]
         return sorted({pair for pair, touches in zip(names, hit, strict=True) if touches})
 
-    def _configurations(self, q: Float[np.ndarray, "n j"], torso: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n m"]:
-        """Pinocchio's configuration vectors: cosine and sine for a continuous joint."""
+    def configurations(self, q: Float[np.ndarray, "n j"], torso: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n m"]:
+        """Configuration vectors of `model`: cosine and sine for a continuous joint."""
         values = np.column_stack([torso, q])[:, self._columns]
         parts = []
         for value, continuous in zip(values.T, self._continuous, strict=True):

@@ -67,6 +67,10 @@ class ReachabilityField:
     margin: float
     """metres added to the network's value, so that few poses pass for reachable that are not"""
 
+    def value(self, T_base_tool: Float[np.ndarray, "n 4 4"], torso: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+        """The value of `distance` alone, in less than half of the time."""
+        return self.network.value(_features(T_base_tool, torso, self.shoulder)[0]) + self.margin
+
     def distance(
         self, T_base_tool: Float[np.ndarray, "n 4 4"], torso: Float[np.ndarray, " n"]
     ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 6"], Float[np.ndarray, " n"]]:

@@ -229,3 +229,30 @@ def solve_from_seeds(  # type: ignore[no-untyped-def]
             if found == wanted:
                 break
     return solutions, costs, nearest, left
+
+
+@compiled
+def follow_branches(fixed, starts, first, lower, upper, targets, L, limits):  # type: ignore[no-untyped-def]
+    """Solutions followed from sample to sample, each by the smallest motion, to both ends of a trajectory.
+
+    starts (b, n): configurations at sample `first` of t targets (t, 3, 4); lower, upper (t, n). Returns b paths
+    (b, t, n) and whether each sample is exact (b, t); where it is not, the path stays where it was before.
+    """
+    b, n = starts.shape
+    t = targets.shape[0]
+    paths, exact = np.zeros((b, t, n)), np.zeros((b, t), np.bool_)
+    q, before = np.empty(n), np.empty(n)
+    for s in range(b):
+        for way in (1, -1):
+            _copy(starts[s], before)
+            i = first
+            while 0 <= i < t:
+                for j in range(n):
+                    q[j] = min(max(before[j], lower[i, j]), upper[i, j])
+                position, angle = descend(fixed, q, lower[i], upper[i], targets[i], L, 30)
+                if position <= limits[0] and angle <= limits[1]:
+                    exact[s, i] = True
+                    _copy(q, before)
+                _copy(before, paths[s, i])
+                i += way
+    return paths, exact

@@ -21,6 +21,8 @@ _FRESH: Final = 6
 _KEPT: Final = 12
 _JUMP: Final = 1e3
 """cost of a step from one branch of solutions to another: taken only where nothing else is left"""
+JUMP_RAD: Final = 0.5
+"""of one joint from sample to sample: more is a jump"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +73,7 @@ def solve_ik_path(
     x, success, jumps = _shortest(problem, layers)
     q = robot.unwrap(x[:, 1:])
     position, angle = pose_distance(robot.forward(q, x[:, 0]), problem.T)
-    share = None if times_s is None else _velocity_share(robot, q, x[:, 0], times_s)
+    share = None if times_s is None else velocity_share(robot, q, x[:, 0], times_s)
     return IKPath(q, x[:, 0].copy(), success, position, angle, jumps, share)
 
 
@@ -142,13 +144,14 @@ def _posture(problem: IKProblem, layer: Float[np.ndarray, "s k"]) -> Float[np.nd
 
 
 def _is_jump(step: Float[np.ndarray, "s m k"], samples: int) -> Bool[np.ndarray, "s m"]:
-    """More than half a radian in one joint, per sample."""
-    return np.asarray(np.abs(step[..., 1:]).max(axis=-1) > 0.5 * samples)
+    """More than `JUMP_RAD` in one joint, per sample."""
+    return np.asarray(np.abs(step[..., 1:]).max(axis=-1) > JUMP_RAD * samples)
 
 
-def _velocity_share(
+def velocity_share(
     robot: Robot, q: Float[np.ndarray, "t j"], torso: Float[np.ndarray, " t"], times_s: Float[np.ndarray, " t"]
 ) -> Float[np.ndarray, " t"]:
+    """Largest joint velocity over its limit, arm and torso, from each sample to the next (the last repeats)."""
     if len(times_s) < 2:
         return np.zeros(len(times_s))
     dt = np.diff(times_s)
