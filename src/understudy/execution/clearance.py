@@ -20,9 +20,8 @@ from understudy.robot.ik import embed
 from understudy.robot.model import Robot
 
 _CELL_M: Final = 0.025
-_LEAST_M: Final = 0.0  # of the links' surfaces to a cell in which something is: to that itself, it is half a cell more
-_HAND_M: Final = np.array([0.07, 0.12])  # behind the tool: middles of balls that cover palm and wrist ...
-_HAND_RADIUS_M: Final = 0.04  # ... to such a cell
+_HAND_M: Final = np.array([0.07, 0.12])  # behind the tool: middles of balls that cover palm and wrist
+_HAND_RADIUS_M: Final = 0.04  # to a cell in which something is
 
 
 class Around:
@@ -51,10 +50,13 @@ class GuardedRobot(Robot):
         T_base_tool: Float[np.ndarray, "t 4 4"],
         T_world_object: Float[np.ndarray, "t 4 4"],
         guarded: Bool[np.ndarray, " t"],
+        spare_m: float = 0.0,
     ):
-        """guarded: samples at which the arm must be clear."""
+        """guarded: samples at which the arm must be clear. spare_m: of the links' surfaces to a cell in which something
+        is; to that itself, it is half a cell more.
+        """
         self.__dict__.update(robot.__dict__)  # the same model, limits and description: nothing is read anew
-        self._robot, self._around, self._guarded = robot, around, guarded
+        self._robot, self._around, self._guarded, self._spare = robot, around, guarded, spare_m
         self._T_world_base = lie.se2_to_se3(base)
         self._T_object_base = lie.se3_inverse(T_world_object) @ self._T_world_base
         self._poses = cKDTree(embed(T_base_tool))
@@ -84,7 +86,7 @@ class GuardedRobot(Robot):
         surface, around = arm_surface(self._robot), self._around
         for field, T in ((around.scene, self._T_world_base[sample]), (around.part, self._T_object_base[sample])):
             if field is not None:
-                clear &= surface.clear(x, T, field.values, field.origin, field.cell_m, _LEAST_M)
+                clear &= surface.clear(x, T, field.values, field.origin, field.cell_m, self._spare)
         if around.scene is not None:
             T_world_tool = self._T_world_base[sample] @ self._robot.forward(q, torso)
             hand = T_world_tool[:, None, :3, 3] - _HAND_M[:, None] * T_world_tool[:, None, :3, 0]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Final, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -13,17 +13,14 @@ from understudy.adaptation.platform import Platform
 from understudy.execution.candidates import APPROACH_M, pivoted
 from understudy.execution.config import TICK_S, Config
 from understudy.execution.control import Arm, HandleEstimate
-from understudy.execution.log import Log
+from understudy.execution.driver import Driver
 from understudy.execution.outcome import Outcome, Reason, Stopped
 from understudy.execution.planning import Plan, make_plan
 from understudy.execution.surroundings import Observed
 from understudy.geometry import inverse
 from understudy.objects.articulation import REVOLUTE, Articulation
 from understudy.robot.model import Robot
-from understudy.robot.simulator import Simulator, Targets, Touch
-
-_FOLDING: Final = 0.5
-"""share of the arm's velocity limits at which it goes back to its posture"""
+from understudy.robot.simulator import Simulator
 
 
 @runtime_checkable
@@ -81,16 +78,12 @@ class _Run:
 
     def __init__(self, execution: Execution, simulator: Simulator):
         self.execution, self.config, self.sim = execution, execution.config, simulator
-        self.robot, self.log, self.touched = execution.robot, Log(), Touch()
-        self.retries, self.planning_s, self.course = 0, 0.0, list[str]()
-        self.opening = 0.0
+        self.robot = execution.robot
+        self.drive = Driver(simulator, execution.robot, execution.config, self.came_back)
+        self.retries, self.planning_s = 0, 0.0
         self.opened_start = simulator.opened
         self.released = False
         self.goal = execution.q_goal
-        state = simulator.state()
-        self.targets = Targets(state.base, state.q, state.torso, state.opening_m)
-        self.arm = Arm(self.robot, state.q)
-        self.rested = state.q.copy()
         self.share = 0.0
 
     def outcome(self) -> Outcome:
@@ -105,30 +98,36 @@ class _Run:
                 break
             except Stopped as stopped:
                 reason, detail = stopped.reason, stopped.detail
-                self.course.append(f"{self.sim.state().time_s:.1f} s: {stopped}")
+                self.drive.course.append(f"{self.sim.state().time_s:.1f} s: {stopped}")
                 again = reason in (Reason.LOST, Reason.MISSED, Reason.OUT_OF_REACH, Reason.BLOCKED)
                 if not again or self.retries >= self.config.retries:
-                    self.stop()
+                    self.drive.stop()
                     break
                 self.retries += 1
-                self.back_off()
-                if self.handle is not None:  # what was let go may have moved since
-                    known = max(0.0, self.handle.position(self.sim.measured_handle_pose(near=True)))
+                try:
+                    self.drive.back_off(self.widest)
+                except Stopped as stuck:
+                    reason, detail = stuck.reason, stuck.detail
+                    self.drive.course.append(f"{self.sim.state().time_s:.1f} s, backing off: {stuck}")
+                    self.drive.stop()
+                    break
+                if self.drive.handle is not None:  # what was let go may have moved since
+                    known = max(0.0, self.drive.handle.position(self.sim.measured_handle_pose(near=True)))
         return Outcome(
             success=reason == Reason.OPENED,
             reason=reason,
             detail=detail,
             opened_share=self.share if self.released else self.opened_share(),
             retries=self.retries,
-            max_force=self.touched.force,
-            course=tuple(self.course),
-            collisions=tuple(sorted(self.touched.unwanted)),
+            max_force=self.drive.touched.force,
+            course=tuple(self.drive.course),
+            collisions=tuple(sorted(self.drive.touched.unwanted)),
+            excused=tuple(sorted(self.drive.excused)),
             duration_s=self.sim.state().time_s - began,
             planning_s=self.planning_s,
-            trajectory=self.log.trajectory(),
+            trajectory=self.drive.log.trajectory(),
         )
 
-    handle: HandleEstimate | None = None
     widest: float = 0.0
     q_held: float = 0.0
     held_at: Float[np.ndarray, "4 4"] | None = None
@@ -140,36 +139,36 @@ class _Run:
         state = self.sim.state()
         start = RobotPose(state.T_world_tool, state.base, state.torso)
         plan = self.execution.planner(
-            self.execution.model, self.robot, self.execution.platform, observed, start, self.targets.q, self.goal
+            self.execution.model, self.robot, self.execution.platform, observed, start, self.drive.targets.q, self.goal
         )
         self.planning_s += plan.processor_s
         self.goal = plan.q_goal
-        self.handle = HandleEstimate(plan.articulation)
+        self.drive.handle = HandleEstimate(plan.articulation)
         q0 = float(plan.articulation.position(observed.T_world_object[None])[0])
-        self.handle.q = q0
+        self.drive.handle.q = q0
         most = self.robot.description.gripper.opening_m
         self.widest = min(most, 2 * observed.handle.radius_m + self.config.clearance_m)
         self.moved_by = np.zeros(3)
-        self.phase = "reach"
+        self.drive.phase = "reach"
         self.reach(plan)
-        self.phase = "approach"
+        self.drive.phase = "approach"
         self.take(plan, observed.handle.radius_m, q0)
-        self.phase = "manipulate"
+        self.drive.phase = "manipulate"
         self.move(plan, observed.handle.radius_m)
-        self.phase = "release"
+        self.drive.phase = "release"
         self.release(plan)
 
     def reach(self, plan: Plan) -> None:
         """Open-loop to before the handle, opening the fingers meanwhile."""
         for t in np.arange(TICK_S, plan.approach_s + TICK_S, TICK_S):
-            self.opening += float(np.clip(self.widest - self.opening, -0.05 * TICK_S, 0.05 * TICK_S))
+            self.drive.opening += float(np.clip(self.widest - self.drive.opening, -0.05 * TICK_S, 0.05 * TICK_S))
             x, v = plan.timed.at(np.array([min(t, plan.approach_s)]))
-            self.send(x[0, :3], v[0, :3], x[0, 3], v[0, 3], x[0, 4:-1], v[0, 4:-1])
-        self.arm = Arm(self.robot, self.targets.q)
+            self.drive.send(x[0, :3], v[0, :3], x[0, 3], v[0, 3], x[0, 4:-1], v[0, 4:-1])
+        self.drive.arm = Arm(self.robot, self.drive.targets.q)
 
     def take(self, plan: Plan, radius: float, q0: float) -> None:
         """Measures the handle from close by, goes onto it, closes the fingers."""
-        c, handle = self.config, self.handle
+        c, handle = self.config, self.drive.handle
         assert handle is not None
         handle.restart()
         self.T_given, self.held_at = np.eye(4), None
@@ -190,20 +189,20 @@ class _Run:
         c = self.config
         pressing = -0.04  # beyond closed: the servo presses with all that its limit allows
         for _ in range(round((c.closing_s + c.settle_s) / TICK_S)):
-            self.opening = max(pressing, self.opening - 0.13 / c.closing_s * TICK_S)
+            self.drive.opening = max(pressing, self.drive.opening - 0.13 / c.closing_s * TICK_S)
             self.measure(q0)
             self.follow(plan, plan.grasp_s, q0)
             self.give_way(np.array([0.0, 1, 0, 0, 0, 0]))  # the fingers centre themselves on the handle
         self.check_held(radius, Reason.MISSED)
-        assert self.handle is not None
+        assert self.drive.handle is not None
         # from now on the handle is where it is in the hand: no force to begin with
         self.q_held = q0
-        self.held_at = inverse(self.handle.pose(q0)) @ self.sim.state().T_world_tool
+        self.held_at = inverse(self.drive.handle.pose(q0)) @ self.sim.state().T_world_tool
         self.T_object_tool, self.T_given = self.held_at, np.eye(4)
 
     def move(self, plan: Plan, radius: float) -> None:
         """Along with the handle as measured; slower when it lags behind."""
-        c, handle = self.config, self.handle
+        c, handle = self.config, self.drive.handle
         assert handle is not None
         handle.restart()
         per = _metres(plan.articulation)
@@ -230,7 +229,7 @@ class _Run:
 
     def across(self, plan: Plan, q: float) -> Float[np.ndarray, "6"]:
         """Along which axes of the tool to give way: not along the handle's way, or nothing would move."""
-        a, b = (self.handle.pose(q + d) for d in (0.0, 0.01))  # type: ignore[union-attr]
+        a, b = (self.drive.handle.pose(q + d) for d in (0.0, 0.01))  # type: ignore[union-attr]
         way = self.sim.state().T_world_tool[:3, :3].T @ (b - a)[:3, 3]
         way = way / np.linalg.norm(way)
         return np.append(1 - way**2, np.ones(3))
@@ -255,33 +254,33 @@ class _Run:
         self.share = self.opened_share()
         self.released = True
         widest = self.widest
-        assert self.handle is not None
-        q_end = self.handle.q
-        held = self.handle.pose(q_end) @ self.pivoted(plan, q_end) @ self.T_object_tool
+        assert self.drive.handle is not None
+        q_end = self.drive.handle.q
+        held = self.drive.handle.pose(q_end) @ self.pivoted(plan, q_end) @ self.T_object_tool
         x, _ = self.planned(plan, plan.release_s)
-        while self.opening < widest:
-            self.opening = min(widest, max(self.opening, 0.0) + 0.1 * TICK_S)
-            self.track(held, x[0])
+        while self.drive.opening < widest:
+            self.drive.opening = min(widest, max(self.drive.opening, 0.0) + 0.1 * TICK_S)
+            self.drive.track(held, x[0])
         for u in np.linspace(0, 1, round(1.2 / TICK_S)):
             offset = np.eye(4)
             offset[0, 3] = -APPROACH_M * u**2 * (3 - 2 * u)
-            self.track(held @ offset, x[0])
+            self.drive.track(held @ offset, x[0])
 
     def follow(
         self, plan: Plan, t: float, q: float | None, share: float = 1.0, rate: float = 1.0, held: bool = False
     ) -> None:
         """One tick: base and torso as planned, the tool where the handle wants it. q: None: as planned."""
-        assert self.handle is not None
+        assert self.drive.handle is not None
         x, v = self.planned(plan, t)
         part = float(x[0, -1]) if q is None else q
         if held:
-            T = self.handle.pose(part) @ self.pivoted(plan, part) @ self.T_object_tool
+            T = self.drive.handle.pose(part) @ self.pivoted(plan, part) @ self.T_object_tool
         else:
             x_far = plan.timed.at(np.array([t]))[0]
             planned = lie.se2_to_se3(x_far[:, :3])[0] @ self.robot.forward(x_far[:, 4:-1], x_far[:, 3])[0]
-            T = lie.se3_exp(share * lie.se3_log(self.handle.T_correct)) @ planned @ self.T_given
+            T = lie.se3_exp(share * lie.se3_log(self.drive.handle.T_correct)) @ planned @ self.T_given
         self.wanted = T
-        self.track(T, x[0], rate * v[0])
+        self.drive.track(T, x[0], rate * v[0])
 
     moved_by: Float[np.ndarray, "3"]
     """of the base's plan, world: x, y, yaw about the origin"""
@@ -295,53 +294,15 @@ class _Run:
         v[0, :2] = T[:2, :2] @ v[0, :2]
         return x, v
 
-    def track(
-        self,
-        T_world_tool: Float[np.ndarray, "4 4"],
-        x: Float[np.ndarray, " k"],
-        v: Float[np.ndarray, " k"] | None = None,
-    ) -> None:
-        """One tick: base and torso as given, the arm wherever it has to be."""
-        v = np.zeros(len(x)) if v is None else v
-        base = self.sim.state().base + TICK_S * v[:3]  # where it is, not where it should be
-        T_base_tool = lie.se3_inverse(lie.se2_to_se3(base[None]))[0] @ T_world_tool
-        q, dq = self.arm.follow(T_base_tool, float(x[3]), x[4:-1], TICK_S)
-        self.send(x[:3], v[:3], float(x[3]), float(v[3]), q, dq)
-
-    def send(
-        self, base: np.ndarray, base_velocity: np.ndarray, torso: float, lift: float, q: np.ndarray, dq: np.ndarray
-    ) -> None:
-        """One tick of the world."""
-        self.targets = Targets(base, q, float(torso), self.opening, base_velocity, dq, float(lift))
-        touch = self.noted(self.sim.step(self.targets, TICK_S))
-        state = self.sim.state()
-        self.log.add(state, self.targets, 0.0 if self.handle is None else self.handle.q, touch.force)
-        if touch.force > self.config.force_n:
-            raise Stopped(Reason.FORCE, f"{touch.force:.0f} N between gripper and part")
-        if state.time_s > self.config.longest_s:
-            raise Stopped(Reason.TIMEOUT, f"not done after {state.time_s:.0f} s")
-
-    def noted(self, touch: Touch) -> Touch:
-        """Keeps what was touched. A self-closing door that comes back after it was let go is not the robot's fault."""
-        came_back = self.released and self.opened_share() < self.share - self.config.came_back
-        mine = [pair for pair in touch.unwanted if not (came_back and self.sim.contacts.is_part(pair[1]))]
-        now = self.sim.state().time_s
-        for a, b in sorted(set(mine) - self.touched.unwanted):
-            self.course.append(f"{now:.1f} s, {self.phase}: {a} on {b}")
-        kept = Touch(touch.pads, touch.force, touch.grip, frozenset(mine))
-        self.touched = self.touched.joined(kept)
-        return kept
-
     _measured_s: float = -1.0
-    phase: str = "reach"
 
     def measure(self, q: float | None) -> None:
         """A measurement of the handle from close by, when the next one is due."""
         now = self.sim.state().time_s
         if now - self._measured_s >= self.config.measure_s:
             self._measured_s = now
-            assert self.handle is not None
-            self.handle.add(self.sim.measured_handle_pose(near=True), q)
+            assert self.drive.handle is not None
+            self.drive.handle.add(self.sim.measured_handle_pose(near=True), q)
 
     def pivoted(self, plan: Plan, q: float) -> Float[np.ndarray, "4 4"]:
         """How far the tool has turned about the handle since it took hold, as planned."""
@@ -355,62 +316,22 @@ class _Run:
                 reason, f"the fingers are {1000 * opening:.0f} mm apart, the handle is {2000 * radius:.0f} mm"
             )
         if plan is not None:
-            assert self.handle is not None
-            expected = self.handle.pose(self.handle.q) @ self.T_object_tool  # turned or not: the same place
+            assert self.drive.handle is not None
+            expected = self.drive.handle.pose(self.drive.handle.q) @ self.T_object_tool  # turned or not: the same place
             away = float(np.linalg.norm(expected[:3, 3] - self.sim.state().T_world_tool[:3, 3]))
             if away > self.config.slipped_m:
                 raise Stopped(reason, f"the handle is {100 * away:.1f} cm from where it was in the hand")
 
     def check_reach(self) -> None:
         """Raises Stopped when the arm cannot be where it should."""
-        if self.arm.error[0] > self.config.missed_m:
-            raise Stopped(Reason.OUT_OF_REACH, f"the tool is {100 * self.arm.error[0]:.1f} cm from where it should be")
+        if self.drive.arm.error[0] > self.config.missed_m:
+            raise Stopped(
+                Reason.OUT_OF_REACH, f"the tool is {100 * self.drive.arm.error[0]:.1f} cm from where it should be"
+            )
 
-    def stop(self) -> None:
-        """Stands still where it is, fingers open."""
-        state = self.sim.state()
-        self.opening = self.robot.description.gripper.opening_m
-        self.targets = Targets(state.base, self.targets.q, state.torso, self.opening)
-        self.noted(self.sim.step(self.targets, 0.5))
-
-    def back_off(self) -> None:
-        """Opens the fingers and goes straight back, the base standing."""
-        state = self.sim.state()
-        x = np.concatenate([state.base, [state.torso], self.targets.q, [0.0]])
-        T = state.T_world_tool
-        self.arm = Arm(self.robot, self.targets.q)
-        self.opening = self.widest
-        for _ in range(round(0.8 / TICK_S)):
-            self.track(T, x)
-        for u in np.linspace(0, 1, round(1.2 / TICK_S)):
-            offset = np.eye(4)
-            offset[0, 3] = -APPROACH_M * u**2 * (3 - 2 * u)
-            self.track(T @ offset, x)
-        self.drive_back(x)
-
-    def drive_back(self, x: Float[np.ndarray, " k"]) -> None:
-        """Away from the furniture, the way that the base came, then the arm as it was before the first attempt: from
-        there a plan is free to begin.
-        """
-        q = self.targets.q.copy()
-        came = [row for row in reversed(self.log.base) if np.linalg.norm(row[:2] - x[:2]) <= self.config.back_m]
-        far = np.cumsum([0.0, *np.linalg.norm(np.diff(np.array(came), axis=0)[:, :2], axis=1)])
-        steps = np.arange(0, far[-1], self.config.back_speed * TICK_S)
-        base = np.column_stack([np.interp(steps, far, column) for column in np.array(came).T])
-        for i, row in enumerate(base):
-            velocity = (base[i + 1] - row) / TICK_S if i + 1 < len(base) else np.zeros(3)
-            self.send(row, velocity, float(x[3]), 0.0, q, np.zeros(len(q)))
-        self.fold(base[-1] if len(base) else x[:3], float(x[3]))
-
-    def fold(self, base: Float[np.ndarray, "3"], torso: float) -> None:
-        """The arm goes back to where it was at first, the base standing."""
-        q = self.targets.q
-        away = np.where(self.robot.continuous, lie.wrapped(self.rested - q), self.rested - q)
-        seconds = max(1.0, float((2 * np.abs(away) / (_FOLDING * self.robot.velocity)).max()))
-        u = np.linspace(0, 1, round(seconds / TICK_S))
-        course = q + (u**2 * (3 - 2 * u))[:, None] * away
-        for row, rate in zip(course, np.gradient(course, TICK_S, axis=0), strict=True):
-            self.send(base, np.zeros(3), torso, 0.0, row, rate)
+    def came_back(self) -> bool:
+        """Whether a part that was let go has closed again: a spring did that."""
+        return self.released and self.opened_share() < self.share - self.config.came_back
 
     def opened_share(self) -> float:
         """True position of the part over the goal."""
@@ -422,8 +343,8 @@ class _Run:
         """After the gripper let go."""
         if self.share < self.config.enough:
             return Reason.NOT_FAR_ENOUGH, f"{100 * self.share:.0f} % of the goal"
-        if self.touched.unwanted:
-            pairs = ", ".join(f"{a} on {b}" for a, b in sorted(self.touched.unwanted)[:4])
+        if self.drive.touched.unwanted:
+            pairs = ", ".join(f"{a} on {b}" for a, b in sorted(self.drive.touched.unwanted)[:4])
             return Reason.COLLISION, pairs
         return Reason.OPENED, f"{100 * self.share:.0f} % of the goal"
 

@@ -70,6 +70,8 @@ class Outcome:
     """newtons, between gripper and part"""
     collisions: tuple[tuple[str, str], ...]
     """(link, what it touched)"""
+    excused: tuple[tuple[str, str], ...]
+    """the same of a part that came back by itself after it was let go; no collisions"""
     duration_s: float
     """simulated"""
     planning_s: float
@@ -87,6 +89,7 @@ class Outcome:
             "course": list(self.course),
             "max_force_n": round(self.max_force, 1),
             "collisions": [list(pair) for pair in self.collisions],
+            "excused": [list(pair) for pair in self.excused],
             "duration_s": round(self.duration_s, 2),
             "planning_s": round(self.planning_s, 2),
         }

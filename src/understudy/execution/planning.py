@@ -50,6 +50,10 @@ _NEAR: Final = 0.6  # share of the way to the handle from which on the arm must 
 _TRIED: Final = 3  # candidates that the graph is solved for, without and with pivoting
 _FEW: Final = 3  # samples that may fail an exact check
 _NOWHERE: Final = 0.8  # share of failing samples
+_SPARE_M: Final = (
+    0.02,
+    0.0,
+)  # of the arm to what is around, the first that is possible: the closed loop bends the plan
 _HOPELESS: Final = 8  # samples that fail after a round with larger margins: no further round
 
 
@@ -260,8 +264,12 @@ def _joints(robot: Robot, around: Around, state: State, task: Demonstration, arr
     T_base_tool = lie.se3_inverse(lie.se2_to_se3(state.base)) @ state.gripper
     guarded = np.arange(len(task)) >= _NEAR * arrived
     T_object = prepare.object_path(task)
-    guard = GuardedRobot(robot, around, state.base, T_base_tool, T_object, guarded)
-    return bridged(guard, solve_ik_path(guard, T_base_tool, state.torso, task.times_s), T_base_tool)
+    for spare in _SPARE_M:
+        guard = GuardedRobot(robot, around, state.base, T_base_tool, T_object, guarded, spare)
+        path = bridged(guard, solve_ik_path(guard, T_base_tool, state.torso, task.times_s), T_base_tool)
+        if path.success[arrived:].all() and not any(jump > arrived for jump in path.jumps):
+            break
+    return path
 
 
 def _widened(failed: Bool[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
