@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -10,11 +12,11 @@ import numpy as np
 import pytest
 from moving_part_scenes import COLOR, Recording, record
 
-from understudy import recordings
+from understudy import recordings, runtime
 from understudy.benchmark.demonstrations import TrueDemonstration, score
 from understudy.camera import RGBDCamera
 from understudy.cli import main
-from understudy.demonstration import storage
+from understudy.demonstration import making, storage
 from understudy.demonstration.build import DemonstrationConfig, build
 from understudy.demonstration.run import ESTIMATION, PICTURE, demonstrate, load_all
 from understudy.errors import RecordingError, UnderstudyError
@@ -112,7 +114,7 @@ def test_a_second_run_takes_over_what_is_done(made, simulated, tmp_path):
 
 def test_one_recording_that_fails_does_not_stop_the_others(made, tmp_path):
     path, out, _ = made
-    results = demonstrate([tmp_path / "nothing", path], out, TASK, detector="recording", hands="depth")
+    results = demonstrate([tmp_path / "nothing", path], out, TASK, detector="recording", hands="depth", jobs=1)
     assert "nothing" in results[0].failed and results[0].demonstration is None
     assert results[1].demonstration is not None
     assert len(load_all([out])) == 1
@@ -120,12 +122,77 @@ def test_one_recording_that_fails_does_not_stop_the_others(made, tmp_path):
         load_all([tmp_path])
 
 
+def test_several_at_a_time_are_the_same_bit_for_bit(made, tmp_path):
+    """With the broken frame and the lost person; and one that fails sooner."""
+    path, _, alone = made
+    paths = [tmp_path / path.name, tmp_path / "nothing"]
+    shutil.copytree(path, paths[0])
+    reported: list[str] = []
+    results = demonstrate(
+        paths, tmp_path / "demos", TASK, detector="recording", hands="depth", jobs=2,
+        report=lambda r: reported.append(r.recording),
+    )  # fmt: skip
+    assert [r.recording for r in results] == list(map(str, paths)), "in the order of the inputs"
+    assert reported == list(map(str, paths[::-1])), "as they come"
+    assert results[1].demonstration is None and "nothing" in results[1].failed
+    for file in (storage.ARRAYS, storage.INFO, f"{ESTIMATION}/{PEOPLE}"):
+        made_together = (results[0].folder / file).read_bytes()
+        expected = (alone.folder / file).read_bytes().replace(str(path).encode(), str(paths[0]).encode())
+        if file != storage.INFO:
+            assert made_together == expected, file
+        else:  # its key is that of a file that names the recording
+            now, before = (json.loads(text) for text in (made_together, expected))
+            assert now["source"].pop("key") != before["source"].pop("key")
+            assert now == before and now["source"]["frames_skipped"] == 1
+    np.testing.assert_array_equal(results[0].demonstration.hand.T_world_x, alone.demonstration.hand.T_world_x)
+
+
+def short(folder: Path, simulated: Recording) -> Path:
+    """The first three frames."""
+    return write(folder, replace(simulated, frames=simulated.frames[:3], people=simulated.people[:3]))
+
+
+def test_a_recording_that_is_named_twice_is_made_once(made):
+    path, out, _ = made
+    reported: list[str] = []
+    one, two = demonstrate(
+        [path, path.parent / "." / path.name], out, TASK, detector="recording", hands="depth", jobs=2,
+        report=lambda r: reported.append(r.recording),
+    )  # fmt: skip
+    assert one is two and one.demonstration is not None and reported == [str(path)]
+
+
+def test_what_should_not_happen_costs_one_recording(simulated, tmp_path, monkeypatch):
+    monkeypatch.setattr(making, "build", lambda *arguments: [][1])
+    path = short(tmp_path / "drawer_1", simulated)
+    result = demonstrate([path], tmp_path / "demos", TASK, method="naive", detector="recording", hands="off")[0]
+    assert result.demonstration is None and "unexpected IndexError" in result.failed
+
+
+def test_networks_are_loaded_once(simulated, tmp_path, monkeypatch):
+    paths = [short(tmp_path / name, simulated) for name in ("drawer_1", "drawer_2")]
+    loaded: list[Path] = []
+    load = runtime.load
+    monkeypatch.setattr(runtime, "load", lambda path, **options: loaded.append(path) or load(path, **options))
+    demonstrate(paths, tmp_path / "demos", TASK, detector="recording", hands="off", jobs=1)
+    assert len(loaded) == 1
+    people = [PeopleFile.read(tmp_path / "demos" / p.name / ESTIMATION / PEOPLE) for p in paths]
+    assert all(len(frame.people) == 1 for file in people for frame in file.frames)
+
+
+def test_bad_numbers_are_refused(tmp_path):
+    with pytest.raises(UnderstudyError, match="2 configs for 1 recordings"):
+        demonstrate(["drawer_1"], tmp_path, [TASK, TASK])
+    with pytest.raises(UnderstudyError, match="drawer_1: is named twice, with different configs"):
+        demonstrate(["drawer_1", "./drawer_1"], tmp_path, [TASK, DemonstrationConfig("room_door")])
+    with pytest.raises(UnderstudyError, match="jobs 0: must be 1 or more"):
+        demonstrate(["drawer_1"], tmp_path, TASK, jobs=0)
+
+
 def test_nobody_and_no_clock_are_explained(made, simulated, tmp_path):
     path, out, _ = made
     with recordings.open(path) as recording:
         frames = PeopleFile.read(out / path.name / ESTIMATION / PEOPLE).frames
-        from dataclasses import replace
-
         with pytest.raises(UnderstudyError, match="nobody"):
             build(recording, [replace(f, people=()) for f in frames], TASK)
         recording.fps = None

@@ -95,6 +95,16 @@ def test_resumes_where_it_stopped(recording, tmp_path, monkeypatch):
     assert len(calls) == 6  # nothing left to do
 
 
+def test_several_frames_at_a_time_are_the_same(recording, tmp_path):
+    (recording / "depth" / "000001.png").write_bytes(b"")
+    alone, steps = run(recording, tmp_path / "alone"), []
+    run(recording, tmp_path / "together", threads=3, step=lambda *n: steps.append(n))
+    assert [f.index for f in alone.frames if f.skipped] == [1]
+    for name in ("people.json", "journal.jsonl", "overlays/000004.png"):
+        assert (tmp_path / "together" / name).read_bytes() == (tmp_path / "alone" / name).read_bytes()
+    assert steps == [(done, FRAMES) for done in range(FRAMES + 1)]
+
+
 def test_interrupting_a_repeated_run_loses_nothing(recording, tmp_path, monkeypatch):
     whole = run(recording, tmp_path / "out", overlays=False)
     before = (tmp_path / "out" / "people.json").read_text()

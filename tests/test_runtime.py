@@ -11,7 +11,7 @@ import pytest
 from scipy import signal
 
 from understudy import assets, recordings, runtime
-from understudy.errors import ModelFileError
+from understudy.errors import ModelFileError, UnderstudyError
 from understudy.registration import register
 from understudy.runtime import Network, load
 
@@ -95,6 +95,21 @@ def test_many_threads_get_the_same_bits(ir, streams):
     with ThreadPoolExecutor(8) as pool:
         together = pool.map(lambda i: (i, network(inputs[i], ONE)[0]), list(range(6)) * 20)
         assert all((alone[i] == y).all() for i, y in together)
+
+
+def test_threads_can_be_limited_from_outside(ir, network, monkeypatch):
+    available = runtime.processors()
+    monkeypatch.setenv(runtime.THREADS, "1")
+    limited = load(ir, threads=2, streams=2)
+    config = limited._compiled.get_property
+    assert runtime.processors() == 1 and config("INFERENCE_NUM_THREADS") == config("NUM_STREAMS") == 1
+    np.testing.assert_array_equal(limited(volume(6), ONE)[0], network(volume(6), ONE)[0])
+    monkeypatch.setenv(runtime.THREADS, "1000")
+    assert runtime.processors() == available
+    for word in ("0", "two", "-1"):
+        monkeypatch.setenv(runtime.THREADS, word)
+        with pytest.raises(UnderstudyError, match=f"UNDERSTUDY_THREADS.*{word}"):
+            load(ir)
 
 
 def test_first_calls_at_the_same_time_do_not_block_each_other(tmp_path):

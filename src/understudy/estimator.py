@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from pathlib import Path
 from typing import Final
 
@@ -27,7 +28,8 @@ class Estimator:
        (`voxel_lifting`: root, view, network, assembly); `naive` is the baseline.
     4. `find_hands`: which way the palms face (`understudy.hands`).
 
-    Stateless: frames may come in any order. Identities over time are the business of `tracking`.
+    Stateless: frames may come in any order, and from several threads at once. Identities over time are the business of
+    `tracking`.
     """
 
     def __init__(
@@ -53,6 +55,12 @@ class Estimator:
         self.detector = detectors.create(detector) if isinstance(detector, str) else detector
         self._lifter = methods.create(method, min_score, weights)
         self._hands = None if hands == "off" else HandNormalEstimator(color=hands == "full")
+
+    def with_detector(self, detector: Detector | str) -> Estimator:
+        """The same with another detector; the other networks are shared, not loaded again."""
+        other = copy(self)
+        other.detector = detectors.create(detector) if isinstance(detector, str) else detector
+        return other
 
     def estimate(self, frame: Frame | RegisteredFrame) -> list[Person]:
         """People of one frame, as many as the detector finds; who cannot be lifted is listed with `failed`."""

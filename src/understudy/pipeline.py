@@ -18,19 +18,24 @@ import re
 import time
 import warnings
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
 import cv2
 
 import understudy
 from understudy import detectors, methods
+from understudy.ahead import in_order
 from understudy.errors import DetectorError, FrameError, RecordingError
 from understudy.estimator import Estimator
-from understudy.files import parse_json, read_json, write_atomically
+from understudy.files import read_json, write_atomically
+from understudy.journal import Entry, read_journal, signature
 from understudy.overlay import draw_frame
-from understudy.people_file import FramePeople, PeopleFile, frame_from_json, frame_to_json
+from understudy.people_file import FramePeople, PeopleFile
 from understudy.recordings import open as open_recording
 from understudy.recordings import write_recording
 from understudy.recordings.base import Recording
@@ -42,7 +47,11 @@ PEOPLE, CONFIG, OVERLAYS, JOURNAL, PAIR = "people.json", "config.json", "overlay
 CONFIG_FORMAT = "estimate-config/1"
 
 Report = Callable[[FramePeople, float], object]
-"""Called with each frame that was estimated, and the seconds that its estimation took."""
+"""Called with each frame that was estimated, and the seconds that its estimation took (with other frames beside it, if
+`threads` says so)."""
+
+OnStep = Callable[[int, int], object]
+"""Called before the first frame and after each: how many are done, and how many there are."""
 
 
 @dataclass(frozen=True)
@@ -79,16 +88,21 @@ def estimate_recording(
     restart: bool = False,
     progress: bool = False,
     report: Report = lambda frame, seconds: None,
+    step: OnStep = lambda done, frames: None,
+    threads: int = 1,
+    estimator: Estimator | None = None,
 ) -> PeopleFile:
     """Estimates every frame of a recording and writes the folder `out`.
 
     An interrupted run goes on where it stopped when it is started again with the same settings; frames whose images
     have changed since are estimated again; `restart` begins anew. A frame that cannot be read is listed with `skipped`
-    and the reason. `overlays`: also a picture per frame. `progress`: a bar on stderr.
+    and the reason. `overlays`: also a picture per frame. `progress`: a bar on stderr. `threads`: frames that are
+    estimated at a time; the results are the same. `estimator`: one of the same settings (method to hands) that is there
+    already, so that its networks are not loaded again.
     Raises RecordingError when `out` holds results of other settings, or something that is not ours.
     """
     out = Path(out)
-    estimator = Estimator(method, detectors.create(detector, recording), min_score, weights, hands)
+    estimator = estimator or Estimator(method, detectors.create(detector, recording), min_score, weights, hands)
     source = (out / PAIR).resolve() if isinstance(recording, PairRecording) else recording.path.resolve()
     reads = _detector_input(recording, detector)
     cameras = recording.camera.to_json()
@@ -98,10 +112,11 @@ def estimate_recording(
     name = recording.name
     if isinstance(recording, PairRecording):
         recording = _kept(recording, out / PAIR)
-    run = _Run(recording, out, estimator, overlays, _read_journal(out / JOURNAL), report)
+    run = _Run(recording, out, estimator, overlays, read_journal(out / JOURNAL), report, threads)
+    step(0, len(recording))
     try:
-        for _ in _bar(run, len(recording), progress):
-            pass
+        for done, _ in enumerate(_bar(run, len(recording), progress), 1):
+            step(done, len(recording))
     finally:  # also when interrupted: what is done can be looked at
         result = PeopleFile(method, name, run.known())
         result.write(out / PEOPLE)
@@ -119,18 +134,6 @@ def _detector_input(recording: Recording, detector: str) -> str:
     return ""
 
 
-def signature(files: list[Path] | tuple[Path, ...]) -> str:
-    """A word that changes when files are replaced, edited or removed: from their names, sizes and times."""
-    parts = []
-    for path in files:
-        try:
-            state = path.stat()
-            parts.append(f"{path.name}:{state.st_size}:{state.st_mtime_ns}")
-        except OSError:
-            parts.append(f"{path.name}:missing")
-    return hashlib.sha256("|".join(parts).encode()).hexdigest()[:16]
-
-
 def _kept(pair: PairRecording, folder: Path) -> Recording:
     """The pair as a recording folder beside its results, so that they can be viewed later."""
     state = folder / "made_from.json"
@@ -141,12 +144,17 @@ def _kept(pair: PairRecording, folder: Path) -> Recording:
     return open_recording(folder)
 
 
-@dataclass(frozen=True)
-class _Done:
-    """A line of the journal."""
+@dataclass(frozen=True, eq=False)
+class _Look:
+    """A frame, before it is known who of its people is who."""
 
     frame: FramePeople
     made_from: str
+    registered: RegisteredFrame | None = None
+    """of a frame that was estimated; None for one that could not be read, or that the journal has"""
+    seconds: float = 0.0
+    known: bool = False
+    """from the journal"""
 
 
 class _Run:
@@ -158,28 +166,27 @@ class _Run:
         out: Path,
         estimator: Estimator,
         overlays: bool,
-        journal: dict[int, _Done],
+        journal: dict[int, Entry],
         report: Report,
+        threads: int,
     ):
         self.recording, self.out, self.estimator, self.overlays = recording, out, estimator, overlays
         self.results: list[FramePeople] = []
-        self._journal, self._report = journal, report
+        self._journal, self._report, self._threads = journal, report, threads
         self._tracker = IdentityTracker()
+        self._one_reads = Lock()
         vanished = journal.keys() - set(recording.indices)
         if vanished:
             warnings.warn(f"{len(vanished)} frames are no longer in {recording.path}: left out", stacklevel=3)
 
     def __iter__(self) -> Iterator[FramePeople]:
-        """Each result is on disk before the next begins."""
-        with (self.out / JOURNAL).open("a", encoding="utf-8") as journal:
-            for position, index in enumerate(self.recording.indices):
-                made_from = signature(self.recording.sources(position))
-                done = self._journal.get(index)
-                known = done is not None and done.made_from == made_from and done.frame.skipped is None
-                frame = self._taken_over(done.frame, position) if known and done else self._estimated(position)
-                if done is None or frame is not done.frame:
-                    line = {"made_from": made_from, **frame_to_json(frame)}
-                    journal.write(json.dumps(line, allow_nan=False) + "\n")
+        """Each result is on disk before the next is there."""
+        looks = in_order((partial(self._look, i) for i in range(len(self.recording))), self._threads)
+        with (self.out / JOURNAL).open("a", encoding="utf-8") as journal, closing(looks):
+            for position, look in enumerate(looks):
+                frame = self._taken_over(look.frame, position) if look.known else self._finished(look)
+                if not look.known or frame is not look.frame:
+                    journal.write(Entry(frame, look.made_from).line())
                     journal.flush()
                 self.results.append(frame)
                 yield frame
@@ -196,24 +203,38 @@ class _Run:
             p.keypoints_2d is not q.keypoints_2d for p, q in zip(frame.people, done.people, strict=True)
         )
         if self.overlays and (renamed or not self._picture(frame.index).exists()):
-            self._draw(self.estimator.register(self.recording[position]), frame)
+            self._draw(self._registered(position), frame)
         return frame if renamed or frame.timestamp_s != done.timestamp_s else done
 
-    def _estimated(self, position: int) -> FramePeople:
-        index = self.recording.indices[position]
-        frame = FramePeople(index, (), self._timestamp(position))
+    def _look(self, position: int) -> _Look:
+        """Runs in several threads at once."""
+        made_from = signature(self.recording.sources(position))
+        done = self._journal.get(self.recording.indices[position])
+        if done is not None and done.made_from == made_from and done.frame.skipped is None:
+            return _Look(done.frame, made_from, known=True)
+        frame = FramePeople(self.recording.indices[position], (), self._timestamp(position))
         start = time.perf_counter()
         try:
-            registered = self.estimator.register(self.recording[position])
+            registered = self._registered(position)
             people = self.estimator.estimate(registered)
         except (FrameError, DetectorError) as error:
-            self._picture(index).unlink(missing_ok=True)
-            return replace(frame, skipped=str(error))
-        frame = self._numbered(replace(frame, people=tuple(people)))
-        self._report(frame, time.perf_counter() - start)
+            return _Look(replace(frame, skipped=str(error)), made_from)
+        return _Look(replace(frame, people=tuple(people)), made_from, registered, time.perf_counter() - start)
+
+    def _finished(self, look: _Look) -> FramePeople:
+        if look.registered is None:
+            self._picture(look.frame.index).unlink(missing_ok=True)
+            return look.frame
+        frame = self._numbered(look.frame)
+        self._report(frame, look.seconds)
         if self.overlays:
-            self._draw(registered, frame)
+            self._draw(look.registered, frame)
         return frame
+
+    def _registered(self, position: int) -> RegisteredFrame:
+        with self._one_reads:  # a recording need not be readable from several threads
+            frame = self.recording[position]
+        return self.estimator.register(frame)
 
     def _timestamp(self, position: int) -> float | None:
         times = self.recording.timestamps_s
@@ -268,25 +289,6 @@ def _is_ours(out: Path) -> bool:
             f"{out}: holds {in_the_way[0]}, which `understudy estimate` did not write there. Choose another folder"
         )
     return False
-
-
-def _read_journal(path: Path) -> dict[int, _Done]:
-    """Finished frames by index; of several lines for a frame the last counts."""
-    if not path.exists():
-        return {}
-    *complete, rest = path.read_bytes().split(b"\n")
-    done: dict[int, _Done] = {}
-    for n, line in enumerate(complete, 1):
-        where = f"{path}: line {n}"
-        try:
-            data = parse_json(line, where)
-            frame = frame_from_json(data, where)
-        except RecordingError as e:
-            raise RecordingError(f"{e}. The journal is damaged; begin anew with --restart") from e
-        done[frame.index] = _Done(frame, str(data.get("made_from")))
-    if rest:  # a line cut short by a crash
-        write_atomically(path, b"\n".join([*complete, b""]))
-    return done
 
 
 def _bar(frames: _Run, total: int, show: bool) -> Iterator[FramePeople]:

@@ -8,6 +8,7 @@ through `openvino_telemetry`. That module is barred first; OpenVINO then takes a
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Sequence
 from functools import cache
@@ -17,7 +18,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from understudy.errors import ModelFileError, one_of
+from understudy.errors import ModelFileError, UnderstudyError, one_of
 
 _ONE_THREAD = Lock()
 """Held while in OpenVINO's Python layer: two threads that use a part of it for the first time can block each other for
@@ -26,6 +27,9 @@ Not held while a network computes."""
 
 KINDS: Final = (".tflite", ".onnx", ".xml")
 """File name endings: TensorFlow Lite, ONNX, OpenVINO IR (its weights beside it, in .bin)."""
+
+THREADS: Final = "UNDERSTUDY_THREADS"
+"""Environment variable: the most threads that each network of this process may use."""
 
 
 class Network:
@@ -63,14 +67,16 @@ def load(path: Path, *, threads: int | None = None, streams: int = 1, outputs: S
     """Reads a network from a file of one of the `KINDS` and compiles it for this CPU. Writes no files.
 
     threads: in all; default: OpenVINO's choice, one a physical core. streams: how many calls run at a time, each on
-    its share of the threads; further calls wait. outputs: names of those that are wanted, in this order (what only
-    the others need is not computed); default: all.
+    its share of the threads; further calls wait. The environment variable `THREADS` limits both. outputs: names of
+    those that are wanted, in this order (what only the others need is not computed); default: all.
     Raises ModelFileError when the file is absent, damaged or not such a network.
     """
     if path.suffix not in KINDS:
         raise ModelFileError(f"{path}: a network's file name must end in {one_of(KINDS)}")
     if not path.is_file():
         raise ModelFileError(f"{path}: there is no such file")
+    if (most := _most_threads()) is not None:
+        threads, streams = min(threads or most, most), min(streams, most)
     config: dict[str, object] = {
         "INFERENCE_PRECISION_HINT": "f32",
         "PERFORMANCE_HINT": "LATENCY",
@@ -85,6 +91,21 @@ def load(path: Path, *, threads: int | None = None, streams: int = 1, outputs: S
     except RuntimeError as e:
         lines = [line for line in str(e).splitlines() if line and not line.startswith(("Exception from", "Check"))]
         raise ModelFileError(f"{path}: damaged, or not a network that OpenVINO can read: {' '.join(lines)}") from e
+
+
+def processors() -> int:
+    """How many processors this process may use: those that it is bound to, no more than `THREADS` says."""
+    bound = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return min(bound, _most_threads() or bound)
+
+
+def _most_threads() -> int | None:
+    word = os.environ.get(THREADS)
+    if not word:
+        return None
+    if not word.isdecimal() or int(word) < 1:
+        raise UnderstudyError(f"environment variable {THREADS}: must be a whole number above 0, got {word!r}")
+    return int(word)
 
 
 def _compiled(path: Path, outputs: Sequence[str], config: dict[str, object]) -> Any:

@@ -46,6 +46,9 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument("--detector", default="blazepose", metavar="NAME", help="as for estimate")
     parser.add_argument("--hands", default="full", metavar="HOW", help="as for estimate: full, depth or off")
     parser.add_argument("--weights", type=Path, metavar="FILE", help="as for estimate")
+    parser.add_argument(
+        "--jobs", type=int, metavar="N", help="recordings at a time, each in a process (default: one a processor)"
+    )
     parser.add_argument("--overlays", action="store_true", help="also a picture of every frame")
     parser.add_argument("--restart", action="store_true", help="begin anew instead of going on")
     parser.set_defaults(run=_demonstrate, after_interrupt="; the same command goes on where it stopped")
@@ -81,6 +84,7 @@ def _demonstrate(arguments: argparse.Namespace) -> int:
         restart=arguments.restart,
         progress=True,
         report=_report,
+        jobs=arguments.jobs,
     )
     made = sum(r.demonstration is not None for r in results)
     print(f"{made} of {len(results)} recordings became demonstrations: {arguments.out}")
@@ -88,13 +92,15 @@ def _demonstrate(arguments: argparse.Namespace) -> int:
 
 
 def _report(result: Result) -> None:
+    from tqdm import tqdm  # writes above the bar
+
     if result.demonstration is None:
-        print(f"understudy: {result.recording}: no demonstration: {result.failed}", file=sys.stderr)
+        tqdm.write(f"understudy: {result.recording}: no demonstration: {result.failed}", file=sys.stderr)
         return
     skipped = result.demonstration.source.get("frames_skipped", 0)
     if skipped:
-        print(f"understudy: {result.recording}: {skipped} frames could not be read", file=sys.stderr)
-    print(f"{result.folder.name}: {describe(result.demonstration)}")
+        tqdm.write(f"understudy: {result.recording}: {skipped} frames could not be read", file=sys.stderr)
+    tqdm.write(f"{result.folder.name}: {describe(result.demonstration)}", file=sys.stdout)
 
 
 def describe(demo: Demonstration) -> str:

@@ -48,6 +48,7 @@ def add(commands: argparse._SubParsersAction) -> None:
 
 def _estimate(arguments: argparse.Namespace) -> int:
     from understudy.pipeline import OVERLAYS, PEOPLE, estimate_recording
+    from understudy.runtime import processors
 
     result = estimate_recording(
         open_recording(arguments),
@@ -60,6 +61,7 @@ def _estimate(arguments: argparse.Namespace) -> int:
         overlays=not arguments.no_overlays,
         restart=arguments.restart,
         progress=True,
+        threads=min(2, processors()),
     )
     skipped = [f for f in result.frames if f.skipped is not None]
     for frame in skipped:

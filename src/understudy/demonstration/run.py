@@ -8,42 +8,31 @@ OUT/NAME/people/                    the estimation of its frames (`pipeline`)
 from __future__ import annotations
 
 import hashlib
-import json
+from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
-import understudy
-from understudy import methods, recordings
-from understudy.demonstration import plots, storage
-from understudy.demonstration.build import DemonstrationConfig, build
+from understudy import methods, runtime
+from understudy.demonstration import storage
+from understudy.demonstration.build import DemonstrationConfig
 from understudy.demonstration.demonstration import Demonstration
-from understudy.errors import MissingExtraError, RecordingError, UnderstudyError
-from understudy.files import read_json, write_atomically
-from understudy.people_file import PeopleFile
-from understudy.pipeline import PEOPLE, estimate_recording
-from understudy.registration import register
+from understudy.demonstration.making import ESTIMATION, PICTURE, Estimation, Maker, Order, Result, picture
+from understudy.demonstration.progress import Progress
+from understudy.errors import RecordingError, UnderstudyError
+from understudy.processes import in_processes
 
-PICTURE: Final = "demonstration.png"
-ESTIMATION: Final = "people"
+__all__ = ["ESTIMATION", "MOST_JOBS", "PICTURE", "Result", "demonstrate", "load_all", "picture"]
 
-
-@dataclass(frozen=True)
-class Result:
-    """What became of one recording."""
-
-    recording: str
-    folder: Path
-    demonstration: Demonstration | None
-    failed: str | None = None
-    """why there is none"""
+MOST_JOBS: Final = 8
+"""processes that are started without being asked for; each takes 0.8 GB of memory"""
 
 
 def demonstrate(
     paths: Sequence[str | Path],
     out: Path,
-    config: DemonstrationConfig | None = None,
+    config: DemonstrationConfig | Sequence[DemonstrationConfig] | None = None,
     *,
     method: str = methods.DEFAULT,
     detector: str = "blazepose",
@@ -53,44 +42,68 @@ def demonstrate(
     restart: bool = False,
     progress: bool = False,
     report: Callable[[Result], object] = lambda result: None,
+    jobs: int | None = None,
 ) -> list[Result]:
-    """Makes a demonstration of each recording, under `out`.
+    """Makes a demonstration of each recording, under `out`. Results come in the order of the recordings.
 
-    method, detector, hands, weights, overlays, restart, progress: as in `pipeline.estimate_recording`. What was
-    finished with the same settings is not made again. report: called with each result as it comes.
+    config: of all recordings, or one for each. method, detector, hands, weights, overlays, restart: as in
+    `pipeline.estimate_recording`. What was finished with the same settings is not made again. progress: a bar on
+    stderr. report: called with each result as it comes.
+
+    jobs: recordings that are worked on at a time, each in a process of its own with its share of the processors; 1: in
+    this process. Default: as many as there are processors, at most `MOST_JOBS`. The results are the same, bit for bit.
+    When a process dies, its recording has failed, and the others go on; when this one is interrupted, all stop, and the
+    same call goes on where they were.
     """
-    out, results, config = Path(out), [], config or DemonstrationConfig()
+    out = Path(out)
+    configs = _each(config or DemonstrationConfig(), len(paths))
     folders = _folders(paths, out)
-    for path, folder in zip(paths, folders, strict=True):
-        try:
-            with recordings.open(path) as recording:
-                estimate_recording(
-                    recording,
-                    folder / ESTIMATION,
-                    method=method,
-                    detector=detector,
-                    hands=hands,
-                    weights=weights,
-                    overlays=overlays,
-                    restart=restart,
-                    progress=progress,
-                )
-                # read back: a run that goes on where another stopped must see the very same (rounded) numbers
-                people = PeopleFile.read(folder / ESTIMATION / PEOPLE)
-                key = _key(folder / ESTIMATION / PEOPLE, config)
-                demo = None if restart else _finished(folder, key)
-                if demo is None:
-                    (folder / storage.INFO).unlink(missing_ok=True)
-                    demo = build(recording, people.frames, config)
-                    demo.source["key"] = key
-                    _draw(recording, demo, folder)
-                    storage.save(folder, demo)
-            result = Result(str(path), folder, demo)
-        except UnderstudyError as e:
-            result = Result(str(path), folder, None, str(e))
-        results.append(result)
-        report(result)
-    return results
+    orders = _orders(paths, folders, configs)
+    maker = Maker(Estimation(method, detector, hands, weights, overlays), restart)
+    jobs = min(_jobs(jobs), len(orders))
+    results: dict[Path, Result] = {}
+    with Progress([order.folder.name for order in orders], progress) as shown:
+
+        def done(number: int, result: Result) -> None:
+            results[orders[number].folder] = result
+            shown.finished(number)
+            report(result)
+
+        def died(number: int, why: str) -> None:
+            done(number, Result(orders[number].recording, orders[number].folder, None, f"{why}; what it had is kept"))
+
+        if jobs > 1:
+            in_processes(orders, maker.make, jobs, told=lambda n, words: shown.step(n, *words), done=done, died=died)
+        else:
+            for number, order in enumerate(orders):
+                done(number, maker.make(order, partial(shown.step, number)))
+    return [results[folder] for folder in folders]
+
+
+def _orders(
+    paths: Sequence[str | Path], folders: Sequence[Path], configs: Sequence[DemonstrationConfig]
+) -> list[Order]:
+    """One for each folder: a recording that is named twice is made once."""
+    orders: dict[Path, Order] = {}
+    for path, folder, config in zip(paths, folders, configs, strict=True):
+        if orders.setdefault(folder, Order(str(path), folder, config)).config != config:
+            raise UnderstudyError(f"{path}: is named twice, with different configs")
+    return list(orders.values())
+
+
+def _each(config: DemonstrationConfig | Sequence[DemonstrationConfig], recordings: int) -> list[DemonstrationConfig]:
+    several = [config] * recordings if isinstance(config, DemonstrationConfig) else list(config)
+    if len(several) != recordings:
+        raise UnderstudyError(f"demonstrate: {len(several)} configs for {recordings} recordings; give one, or as many")
+    return several
+
+
+def _jobs(asked: int | None) -> int:
+    if asked is None:
+        return min(runtime.processors(), MOST_JOBS)
+    if asked < 1:
+        raise UnderstudyError(f"jobs {asked}: must be 1 or more")
+    return asked
 
 
 def load_all(paths: Sequence[str | Path]) -> list[Demonstration]:
@@ -109,50 +122,13 @@ def load_all(paths: Sequence[str | Path]) -> list[Demonstration]:
 
 def _folders(paths: Sequence[str | Path], out: Path) -> list[Path]:
     """A folder for each recording, by its name; recordings of the same name are told apart by where they lie."""
-    names = [Path(p).resolve().stem if Path(p).is_file() else Path(p).resolve().name for p in paths]
+    places = [Path(path).resolve() for path in paths]
+    names = {place: place.stem if place.is_file() else place.name for place in places}
+    times = Counter(names.values())
     folders = []
-    for path, name in zip(paths, names, strict=True):
-        if names.count(name) > 1:
-            name = f"{name}_{hashlib.sha256(str(Path(path).resolve()).encode()).hexdigest()[:6]}"
+    for place in places:
+        name = names[place]
+        if times[name] > 1:
+            name = f"{name}_{hashlib.sha256(str(place).encode()).hexdigest()[:6]}"
         folders.append(out / name)
     return folders
-
-
-def _key(people: Path, config: DemonstrationConfig) -> str:
-    """Changes when anything does that the demonstration is made from."""
-    markers = Path(config.markers).read_bytes() if config.markers else b""
-    parts = [people.read_bytes(), markers, json.dumps(asdict(config)).encode(), understudy.__version__.encode()]
-    return hashlib.sha256(b"|".join(hashlib.sha256(p).digest() for p in parts)).hexdigest()[:16]
-
-
-def _finished(folder: Path, key: str) -> Demonstration | None:
-    """What an earlier run has made of the same; None if it is damaged: it is made again then."""
-    if not (folder / storage.INFO).exists():
-        return None
-    try:
-        source: Any = read_json(folder / storage.INFO).get("source")
-        return storage.load(folder) if isinstance(source, dict) and source.get("key") == key else None
-    except RecordingError:
-        return None
-
-
-def _draw(recording: recordings.Recording, demo: Demonstration, folder: Path) -> None:
-    try:
-        write_atomically(folder / PICTURE, picture(recording, demo))
-    except MissingExtraError:
-        return  # pictures are optional, as matplotlib is
-
-
-def picture(recording: recordings.Recording | None, demo: Demonstration) -> bytes:
-    """`plots.plot` over the frame at which the hand grasps; without a recording, the scene from the side."""
-    if recording is None or not len(recording):
-        return plots.plot(demo)
-    times = recording.timestamps_s or [i / (recording.fps or 1.0) for i in recording.indices]
-    grasp = demo.times_s[demo.segments.grasp]
-    for position in sorted(range(len(recording)), key=lambda i: abs(times[i] - grasp))[:10]:
-        try:
-            frame = register(recording[position])
-        except RecordingError:
-            continue
-        return plots.plot(demo, frame.color, frame.camera)
-    return plots.plot(demo)
