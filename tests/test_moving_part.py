@@ -10,13 +10,16 @@ import numpy as np
 import pytest
 from moving_part_scenes import COLOR, Recording, record
 
+from understudy.camera import Camera
 from understudy.errors import FrameError, UnderstudyError
 from understudy.geometry import angle_between, inverse, rigid, transform_points
-from understudy.objects.articulation import FIXED, PRISMATIC, REVOLUTE, Articulation
+from understudy.objects.articulation import FIXED, PRISMATIC, REVOLUTE, Articulation, Handle
 from understudy.objects.moving_part import HandHint, MovingPart, find_moving_part
+from understudy.objects.moving_part.bar import settle_on_bar
 from understudy.objects.moving_part.hinge import fit_hinge
 from understudy.objects.moving_part.motion import perturbed, spread_frames
-from understudy.objects.moving_part.scoring import PartModel, Scorer
+from understudy.objects.moving_part.region import telling
+from understudy.objects.moving_part.scoring import HIDDEN, Comparison, PartModel, Scorer, point_scores
 from understudy.objects.moving_part.search import hand_path, hand_q
 from understudy.objects.moving_part.stack import UNIT, DepthStack, Frames, left, person_mask, reference
 from understudy.types import RegisteredFrame
@@ -198,6 +201,91 @@ def test_what_stays_is_told_from_what_leaves() -> None:
     u, v = np.round(stack.camera.project(center[None])[0]).astype(int)
     assert gone[v - 2 : v + 3, u - 2 : u + 3].mean() > 0.7
     assert gone[:20].mean() < 0.05  # the wall
+
+
+# --- the handle's bar ---
+
+CAMERA = Camera(240, 240, np.array([[270.0, 0, 119.5], [0, 270.0, 119.5], [0, 0, 1.0]]))
+FRONT, HALF, RADIUS, OUT = 2.0, 0.12, 0.01, 0.05  # metres: distance of the front; bar
+# looks straight at the front; the bar's z is up
+T_CAM_HANDLE = rigid(np.array([[0, 1.0, 0], [0, 0, -1], [-1, 0, 0]]), np.array([0.04, 0.03, FRONT - OUT]))
+
+
+def bar_images(hidden: Sequence[tuple[float, float]], hand: Sequence[bool]) -> DepthStack:
+    """Depth of a bar before a front. hidden: from where to where (along the bar) a body is before it; hand: whether one
+    holds its middle. Nobody is marked.
+    """
+    v, u = np.mgrid[0:240, 0:240]
+    rays = np.stack([(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones(u.shape)], -1)
+    at = rays * (FRONT - OUT) - T_CAM_HANDLE[:3, 3]
+    across, along = at[..., 0], -at[..., 1]
+    z = np.full((len(hidden), 240, 240), FRONT)
+    for image, (low, high), held in zip(z, hidden, hand, strict=True):
+        image[(np.abs(across) < RADIUS) & (np.abs(along) < HALF)] = FRONT - OUT - RADIUS
+        if held:
+            image[(np.abs(across) < 0.045) & (np.abs(along) < 0.045)] = FRONT - OUT - RADIUS
+        image[(along > low) & (along < high)] = 1.6
+    k = len(z)
+    return DepthStack(CAMERA, (z / UNIT).astype(np.uint16), np.zeros(z.shape, bool), np.ones(k, bool))
+
+
+def settled(stack: DepthStack, along: float, length: float) -> tuple[np.ndarray, Handle]:
+    """From a handle that was put `along` metres beside the bar's middle; what it then is in the true handle's frame."""
+    T = T_CAM_HANDLE @ rigid(np.eye(3), np.array([0.008, -0.006, along]))
+    k = len(stack)
+    still = Articulation(PRISMATIC, T, T[:3, 0], T[:3, 3], (0.0, 0.0))
+    T, handle = settle_on_bar(stack, np.eye(4), still, np.zeros(k), np.arange(k), T, Handle(length, 0.006, OUT + 0.008))
+    return (inverse(T_CAM_HANDLE) @ T)[:3, 3], handle
+
+
+def test_a_bar_is_put_together_from_what_each_frame_shows() -> None:
+    hidden = [(-1.0, 0.03)] * 5 + [(-0.04, 1.0)] * 4  # no frame shows more than half of it
+    at, handle = settled(bar_images(hidden, [False] * 9), along=0.045, length=0.1)
+    assert np.abs(at).max() < 0.006
+    assert abs(handle.length_m - 2 * HALF) < 0.012 and abs(handle.radius_m - RADIUS) < 0.004
+    assert abs(handle.standoff_m - OUT) < 0.006
+
+
+def test_a_hand_on_the_bar_is_no_bar() -> None:
+    at, handle = settled(bar_images([(2.0, 2.0)] * 8, [True] * 8), along=-0.03, length=0.16)
+    assert np.abs(at).max() < 0.006 and abs(handle.length_m - 2 * HALF) < 0.012
+    assert abs(handle.radius_m - RADIUS) < 0.004
+
+
+def test_an_end_that_nobody_saw_is_in_doubt_by_as_much_as_is_hidden() -> None:
+    at, handle = settled(bar_images([(0.08, 0.16)] * 8, [False] * 8), along=0.0, length=0.16)
+    low, high = at[2] - handle.length_m / 2, at[2] + handle.length_m / 2
+    assert abs(low + HALF) < 0.01 and 0.08 < high < 0.16
+
+
+def test_without_a_bar_the_handle_stays() -> None:
+    at, handle = settled(bar_images([(-1.0, 1.0)] * 6, [False] * 6), along=0.02, length=0.1)
+    np.testing.assert_allclose(at, [0.008, -0.006, 0.02], atol=1e-12)
+    assert handle.length_m == 0.1
+
+
+def test_the_ends_of_a_sliding_front_tell_where_it_is() -> None:
+    y, z = (g.ravel() for g in np.meshgrid(np.linspace(0, 0.8, 41), np.linspace(0, 1.5, 76)))
+    front = np.column_stack([np.zeros_like(y), y, z])
+    handle = np.array([[-0.04, 0.4, 0.9], [-0.04, 0.4, 0.95]])
+    model = PartModel(np.vstack([front, handle]), np.arange(len(y) + 2) < len(y), np.array([-1.0, 0, 0]))
+    slides = Articulation(PRISMATIC, np.eye(4), np.array([0, 1.0, 0]), np.zeros(3), (0.0, 0.5))
+    told = telling(model, slides)
+    inner = told.points[told.flat][:, 1]
+    assert ((inner < 0.0601) | (inner > 0.7399)).all() and (inner == 0).sum() == (inner == 0.8).sum() == 76
+    np.testing.assert_array_equal(told.points[~told.flat], handle)
+    pulled = replace(slides, direction=np.array([-1.0, 0, 0]))
+    assert telling(model, pulled) is model  # all of a drawer's front tells
+
+
+def test_a_part_gains_nothing_by_hiding_behind_people() -> None:
+    yes, no = np.ones((1, 3), bool), np.zeros((1, 3), bool)
+    there = Comparison(np.zeros((1, 3), np.float32), yes, no, yes, no)  # found, where a person may be
+    behind = replace(there, gap=np.full((1, 3), 0.5, np.float32))
+    assert point_scores(there, 0.01, hidden=HIDDEN).mean() >= point_scores(behind, 0.01, hidden=HIDDEN).mean()
+    assert point_scores(there, 0.01).max() == 0  # says nothing about which points move
+    beyond = replace(there, gap=np.full((1, 3), -0.5, np.float32))
+    np.testing.assert_allclose(point_scores(beyond, 0.01, hidden=HIDDEN), -1, atol=1e-6)
 
 
 def test_hand_path_bridges_gaps_with_doubt_and_drops_outliers() -> None:

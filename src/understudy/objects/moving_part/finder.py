@@ -12,14 +12,14 @@ from scipy.ndimage import minimum_filter1d
 
 from understudy.errors import UnderstudyError
 from understudy.geometry import inverse, is_rigid, transform_points
-from understudy.objects.articulation import REVOLUTE, Articulation, Handle
-from understudy.objects.moving_part.handle import find_handle
+from understudy.objects.articulation import REVOLUTE, Articulation
+from understudy.objects.moving_part.grip import Part, handle_near, handle_of
 from understudy.objects.moving_part.hinge import fit_hinge
 from understudy.objects.moving_part.motion import Motion, refine, sharpen, spread_frames, track
 from understudy.objects.moving_part.outcome import at_handle, at_rest, pose_track, reversed_
 from understudy.objects.moving_part.part import HandHint, MovingPart, MovingPartConfig
-from understudy.objects.moving_part.region import Region, grow
-from understudy.objects.moving_part.scoring import PartModel, Scorer, in_part, motions
+from understudy.objects.moving_part.region import Region, grow, telling
+from understudy.objects.moving_part.scoring import PartModel, Scorer, in_part
 from understudy.objects.moving_part.search import (
     HandPath,
     Hypothesis,
@@ -31,7 +31,7 @@ from understudy.objects.moving_part.search import (
     step_m,
     try_panel,
 )
-from understudy.objects.moving_part.stack import DepthStack, Frames, Reference, changed, left, reference
+from understudy.objects.moving_part.stack import DepthStack, Frames, Reference, changed, reference
 from understudy.types import Person
 
 _FAMILY: Final = {"out": 1.0, "level": 1.0, "hinge": 1.0, "flap": 0.7, "lift": 0.7}  # how common they are
@@ -198,11 +198,14 @@ class _Finder:
 
     def _polished(self, t: _Tracked) -> _Tracked:
         """With a last track that hardly cares about the hand; a hinge is fitted to it again."""
-        t = replace(t, motion=self._follow(t.model, t.articulation, 200, 0.01, _TRUST_LAST))
+        t = replace(t, motion=self._last(t))
         for _ in range(_POLISHED if t.articulation.kind == REVOLUTE else 0):
             t = replace(t, articulation=self._fit(t, 0.008)[0])
-            t = replace(t, motion=self._follow(t.model, t.articulation, 200, 0.01, _TRUST_LAST))
+            t = replace(t, motion=self._last(t))
         return t
+
+    def _last(self, t: _Tracked) -> Motion:
+        return self._follow(telling(t.model, t.articulation), t.articulation, 200, 0.01, _TRUST_LAST)
 
     def _held(self, articulation: Articulation, q: np.ndarray, moving: np.ndarray) -> Float[np.ndarray, "n 3"]:
         """Where the hand is on the part while it moves (world, at rest)."""
@@ -225,7 +228,8 @@ class _Finder:
     # --- result ---
 
     def _result(self, t: _Tracked, runner_up: float) -> MovingPart:
-        motion = sharpen(self.scorer, t.model.thinned(self.config.points, self.rng), t.articulation, t.motion)
+        sharp = telling(t.model, t.articulation).thinned(self.config.points, self.rng)
+        motion = sharpen(self.scorer, sharp, t.articulation, t.motion)
         q = motion.q
         assert motion.curvature is not None
         way = np.abs(q) * step_m(t.articulation)
@@ -235,15 +239,8 @@ class _Finder:
         if way.max() < self.config.least_way_m:
             return self._still()
         grip = np.median(self._held(t.articulation, q, moving), axis=0)
-        front = float(t.model.points[t.model.flat].mean(0) @ t.model.normal)
-        gone = left(self.stack, self.ref, np.flatnonzero(self.stack.usable & (way > 0.5 * way.max())))
-        T_rest, handle, seen = self._handle(self.ref, np.eye(4), t.model.normal, front, grip, gone)
-        if not seen and last < len(q) - 3:  # somebody stood before it: look again where it came to rest
-            after = reference(self.stack, np.arange(last + 1, len(q)), self.T_world_cam)
-            moved = motions(t.articulation, q[-1:])[0]
-            came = left(self.stack, after, np.flatnonzero(self.stack.usable & (way < 0.05)))
-            again = self._handle(after, moved, t.model.normal, front, grip, came)
-            T_rest, handle, seen = again if again[2] else (T_rest, handle, seen)
+        part = Part(t.articulation, t.model, q, observed, last)
+        T_rest, handle, seen = handle_of(part, self.stack, self.ref, self.T_world_cam, grip)
         articulation = at_handle(t.articulation, T_rest, q)
         if np.median(q[last:]) < 0:
             articulation, q = reversed_(articulation), -q
@@ -261,24 +258,6 @@ class _Finder:
         points = transform_points(inverse(T_rest), t.model.points)
         return MovingPart(track, articulation, handle, q, sigma_m / reach, (first, last), points, quality)
 
-    def _handle(
-        self,
-        ref: Reference,
-        moved: np.ndarray,
-        normal: np.ndarray,
-        front: float,
-        hand: np.ndarray,
-        free: Bool[np.ndarray, "h w"],
-    ) -> tuple[np.ndarray, Handle, bool]:
-        """T_world_handle at rest, looked for where `moved` takes the part: normal, front and hand are those at rest."""
-        at = transform_points(moved, hand)
-        n = moved[:3, :3] @ normal
-        ray = at - self.T_world_cam[:3, 3]
-        pixel_m = float(ray @ self.T_world_cam[:3, 2]) / self.stack.camera.fx
-        offset = float(n @ transform_points(moved, normal * front))
-        T, handle, seen = find_handle(ref, n, offset, at, ray / np.linalg.norm(ray), pixel_m, free)
-        return inverse(moved) @ T, handle, seen
-
     def _still(self) -> MovingPart:
         """Nothing moves: the handle where the hand was nearest to a front."""
         panels: list[Panel] = []
@@ -293,8 +272,7 @@ class _Finder:
         panel = panels[len(panels) // 2]
         normal = panel.model.normal
         front = float(panel.model.points[panel.model.flat].mean(0) @ normal)
-        T_rest, handle, seen = self._handle(
-            self.ref, np.eye(4), normal, front, panel.T_world_panel[:3, 3], self.ref.z > 0
-        )
+        camera, at = self.stack.camera, panel.T_world_panel[:3, 3]
+        T_rest, handle, seen = handle_near(self.ref, camera, self.T_world_cam, normal, front, at, self.ref.z > 0)
         points = transform_points(inverse(T_rest), panel.model.points)
         return at_rest(T_rest, handle, seen, points, self.stack.usable)

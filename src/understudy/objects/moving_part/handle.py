@@ -15,7 +15,8 @@ from understudy.objects.moving_part.stack import Reference
 _NEAR: Final = 0.25  # metres between the hand's middle place and the handle's
 _OUT: Final = (0.012, 0.13)  # metres in front of the panel
 _LONG: Final = 1.4  # times as long as wide: a bar with a direction
-_KNOB: Final = 0.06  # metres: what is shorter has no direction that one could see, and counts as level
+KNOB: Final = 0.06
+"""metres: what is shorter has no direction that one could see, and counts as level"""
 _LEVEL: Final = 0.5  # vertical component of a bar's direction up to which it counts as level
 _STRAIGHT: Final = float(np.cos(np.radians(35)))
 _LEAST: Final = 4  # pixels
@@ -88,7 +89,7 @@ def _bar(points: np.ndarray, normal: np.ndarray, up: np.ndarray) -> tuple[np.nda
     flat = np.column_stack([(points - center) @ side, (points - center) @ up])
     if len(flat) > 5:
         values, vectors = np.linalg.eigh(np.cov(flat.T))
-        elongated = values[1] > max(_LONG**2 * values[0], _KNOB**2 / 12)
+        elongated = values[1] > max(_LONG**2 * values[0], KNOB**2 / 12)
         main = vectors[:, 1] if elongated else np.array([1.0, 0.0])
     else:
         main = np.array([1.0, 0.0])

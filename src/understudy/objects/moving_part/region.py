@@ -26,6 +26,7 @@ _CONTRADICTED: Final = -0.35  # evidence below which a point stays where it is, 
 _IN_PLANE: Final = 0.3  # of the direction along the normal
 _FIT_FROM: Final = 60  # flat points
 _STRICT: Final = 0.006
+_END, _STRIP = 0.06, 0.03  # metres along and across the way that a front slides
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +79,24 @@ def grow(
     return Region(
         _fitted(everything.part(chosen)), float((news * area)[chosen].sum()), np.column_stack([rows, columns])[chosen]
     )
+
+
+def telling(model: PartModel, articulation: Articulation) -> PartModel:
+    """The points that say where the part is.
+
+    Of a front that slides in its own plane these are the ones at its ends, and what stands out: wherever it goes, the
+    others find themselves on it.
+    """
+    if not _in_plane(articulation, model.normal) or model.flat.sum() < _FIT_FROM:
+        return model
+    along = model.points @ articulation.direction
+    strip = np.rint(model.points @ np.cross(articulation.direction, model.normal) / _STRIP).astype(int)
+    strip -= strip.min()
+    least, most = np.full(strip.max() + 1, np.inf), np.full(strip.max() + 1, -np.inf)
+    np.minimum.at(least, strip[model.flat], along[model.flat])
+    np.maximum.at(most, strip[model.flat], along[model.flat])
+    ends = ~model.flat | (along < least[strip] + _END) | (along > most[strip] - _END)
+    return model.part(ends) if (ends & model.flat).sum() >= _FIT_FROM else model
 
 
 def _in_plane(articulation: Articulation, normal: Float[np.ndarray, "3"]) -> bool:

@@ -139,11 +139,12 @@ def point_scores(
     """1 = there, -1 = seen through, `-unexplained` = hidden by what has no explanation, `hidden` = by a person, else 0.
 
     To compare places of a part, what a person hides must not count for less than what is seen, or parts would flee from
-    people; to judge points, it must not count at all.
+    people; to judge points, it must not count at all. What is found where a person may be counts as much as what is
+    hidden: less, and parts would hide behind people.
     """
     there = np.exp(np.float32(-0.5 / sigma_m**2) * c.gap * c.gap)
-    known = c.explained | c.person
-    worth = np.where(known & ~c.home, np.float32(OLD), np.float32(1))
+    old = np.where(c.explained, np.float32(OLD), np.float32(1))
+    worth = np.where(c.home, np.float32(1), np.where(c.person, np.float32(hidden), old))
     covered = np.where(c.person, np.float32(hidden), np.where(c.explained, np.float32(0), np.float32(-unexplained)))
     s = there * worth + (1 - there) * np.where(c.gap < 0, np.float32(-1), covered)
     return np.where(c.seen, s, np.float32(0.5 * hidden))
