@@ -42,6 +42,7 @@ from understudy.recordings.base import Recording
 from understudy.recordings.pair import PairRecording
 from understudy.tracking import IdentityTracker
 from understudy.types import RegisteredFrame
+from understudy.voxelposenet.predictor import weights_path
 
 PEOPLE, CONFIG, OVERLAYS, JOURNAL, PAIR = "people.json", "config.json", "overlays", "journal.jsonl", "pair"
 CONFIG_FORMAT = "estimate-config/1"
@@ -70,7 +71,7 @@ class Settings:
     min_score: float
     hands: str = "full"
     weights: str = ""
-    """SHA-256 of a network of one's own; empty for the one that comes with the package"""
+    """SHA-256 of the network: results of another one, or of another version's, do not mix with it"""
     version: str = understudy.__version__
     format: str = CONFIG_FORMAT
 
@@ -106,8 +107,8 @@ def estimate_recording(
     source = (out / PAIR).resolve() if isinstance(recording, PairRecording) else recording.path.resolve()
     reads = _detector_input(recording, detector)
     cameras = recording.camera.to_json()
-    own = hashlib.sha256(weights.read_bytes()).hexdigest() if weights else ""
-    settings = Settings(str(source), cameras, recording.unit_m, method, detector, reads, min_score, hands, own)
+    network = hashlib.sha256((weights or weights_path()).read_bytes()).hexdigest()
+    settings = Settings(str(source), cameras, recording.unit_m, method, detector, reads, min_score, hands, network)
     _prepare(out, settings, restart)
     name = recording.name
     if isinstance(recording, PairRecording):
