@@ -19,6 +19,7 @@ from common import report
 
 from understudy.robot.field import load_field, train_field, typical_poses, uniform_poses
 from understudy.robot.ik import solve_ik
+from understudy.robot.ik_follow import follow_ik_path
 from understudy.robot.ik_path import solve_ik_path
 from understudy.robot.model import Robot, load_robot
 from understudy.robot.reachability import build_map, load_map
@@ -50,6 +51,7 @@ def warm_up(robot: Robot) -> None:
     """Compiles, reads meshes, makes the seed table, fills the caches."""
     q, torso = robot.sample(2)
     solve_ik(robot, robot.forward(q, torso), torso)
+    follow_ik_path(robot, robot.forward(q, torso), torso, np.arange(2.0))
     load_field(robot).distance(robot.forward(q, torso), torso)
     load_map(robot)
 
@@ -87,12 +89,14 @@ def inverse(robot: Robot) -> list[list[str]]:
     path = np.tile(np.eye(4), (150, 1, 1))
     path[:, :3, 3] = np.column_stack([np.full(150, 0.65), np.linspace(-0.6, -0.2, 150), np.full(150, 0.9)])
     along, e = seconds(lambda: solve_ik_path(robot, path, np.full(150, 0.1)))
+    quick, f = seconds(lambda: follow_ik_path(robot, path, np.full(150, 0.1), 0.1 * np.arange(150)))
     return [
         ["IK, limits only", f"{len(T) / bare:.0f} poses/s", f"{a.success.mean():.2%} solved"],
         ["IK, free of self-collision", f"{free.sum() / checked:.0f} poses/s", f"{b.success.mean():.2%} solved"],
         ["IK, free torso", f"{len(T) / lifted:.0f} poses/s", f"{c.success.mean():.2%} solved"],
         ["IK, box around the robot", f"{1000 / mixed:.0f} poses/s", f"{d.success.mean():.1%} reachable"],
         ["IK path, 150 steps", f"{1000 * along:.0f} ms", f"{e.success.mean():.1%} solved, {len(e.jumps)} jumps"],
+        ["the same, followed", f"{1000 * quick:.0f} ms", f"{f.success.mean():.1%} solved, {len(f.jumps)} jumps"],
     ]
 
 

@@ -124,6 +124,42 @@ def demonstration(task: str, seed: int = 0, noise: Noise | None = None, samples:
     )  # fmt: skip
 
 
+def doorway(width_m: float, seed: int = 0, samples: int = 70) -> Demonstration:
+    """Someone pushes a gate that hangs on rails through a doorway in the wall x = -0.15 to 0, and walks after it.
+
+    The person is narrower than a robot's base: goes through 0.25 m beside the middle, turned by 35 degrees. The map has
+    cells of 5 cm; widths are odd multiples of that.
+    """
+    rng = np.random.default_rng([seed, 99])
+    T = _pose(UPRIGHT, (0.7, 0.0, 1.0))
+    articulation, handle = (
+        Articulation("prismatic", T, np.array([-1.0, 0, 0]), T[:3, 3], (0.0, 2.2)),
+        Handle(0.2, 0.01, 0.05),
+    )
+    times = 0.2 * np.arange(samples)
+    grasp, release = int(0.25 * samples), int(0.9 * samples)
+    q = 2.2 * _smooth_step((np.arange(samples) - grasp - 1) / (release - grasp - 2))
+    T_object = articulation.pose(q)
+    T_hand = _hand(rng, T_object, q / 2.2, grasp, release)
+    walk = _smooth_step(np.arange(samples) / (0.8 * grasp))
+    x = 1.2 + 0.4 * (1 - walk) - q
+    aside = np.exp(-((x / 0.5) ** 2))
+    P = np.column_stack([x, 0.25 * aside, np.pi + np.radians(35) * aside])
+    x, y = 0.05 * np.arange(-50, 50), 0.05 * np.arange(-40, 41)
+    X, Y = np.meshgrid(x, y)
+    wall = (X < 0.01) & (X > -0.16) & (np.abs(Y) > width_m / 2)
+    state = np.where(wall | (np.abs(Y) > 1.9), OCCUPIED, FREE).astype(np.uint8)
+    hand, torso = _seen(rng, T_hand, P, Noise(), 0.2)
+    known = np.ones(samples, bool)
+    object = PoseTrack(T_object, np.tile(1e-6 * np.eye(6), (samples, 1, 1)), known, known)
+    return Demonstration(
+        "gate", times, "right", hand, torso, object, articulation, handle, Segments(grasp, release),
+        OccupancyMap(state, np.array([x[0], y[0]]), 0.05), np.zeros((0, 3), np.float32),
+        _pose(np.array([[0, 0, -1.0], [1, 0, 0], [0, -1, 0]]), (3.2, -0.8, 1.6)), np.full((samples, 18, 3), np.nan),
+        source={"truth": "tests/adaptation_scenes.py"},
+    )  # fmt: skip
+
+
 def demonstrations(task: str, n: int = 5, noise: Noise | None = None, samples: int = 110) -> list[Demonstration]:
     """Several of one task, which share a map."""
     shown = [demonstration(task, seed, noise, samples) for seed in range(n)]
@@ -200,6 +236,10 @@ class Shell:
     weight: float = 0.4
     smooth: float = 0.02
     """metres: within this the three conditions blend"""
+
+    def value(self, T_base_tool: np.ndarray, torso: np.ndarray) -> np.ndarray:
+        """As `platform.Reachability`."""
+        return self.distance(T_base_tool, torso)[0]
 
     def distance(self, T_base_tool: np.ndarray, torso: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """As `platform.Reachability`."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,9 +15,11 @@ import pytest
 from understudy import lie
 from understudy.adaptation import calibration, edges, grasps, metrics, most, placement, plots, prepare, storage
 from understudy.adaptation.adapt import AdaptConfig, adapt
-from understudy.adaptation.calibration import DEFAULT_HAND_TOOL, Calibration
+from understudy.adaptation.calibration import DEFAULT_HAND_TOOL, DEFAULT_TORSO_BASE, Calibration
+from understudy.adaptation.clock import Motion, retimed
 from understudy.adaptation.errors import InfeasibleError
-from understudy.adaptation.fields import collision_free
+from understudy.adaptation.fields import collision_free, outline
+from understudy.adaptation.platform import Arm, JointPath, Platform
 from understudy.adaptation.result import AdaptationResult
 from understudy.adaptation.weights import SCHEDULE
 from understudy.demonstration.demonstration import FREE, OCCUPIED, Demonstration
@@ -119,6 +122,53 @@ def test_an_obstacle_in_the_way_is_walked_round() -> None:
         assert (collision_free(d.map, platform.footprint, a.base) == a.collision_free).all()
 
 
+def test_through_a_doorway_of_85_cm() -> None:
+    """The teacher's way, taken by a base 66 cm wide, clips the jamb, and is turned too far to fit."""
+    d, platform = scenes.doorway(0.85), scenes.platform(0.005)
+    begin = time.process_time()
+    result = adapt([d], platform)
+    assert time.process_time() - begin < 10  # 0.3 s without the type checks of tests
+    after = _keeps_everything([d], result)
+    before = metrics.evaluate([d], result, platform)["before"]
+    assert before.map_free_percent < 95
+    base = result.demonstrations[0].base
+    inside = base[(base[:, 0] > -0.3) & (base[:, 0] < 0.15)]
+    assert len(inside) >= 5 and np.abs(inside[:, 1]).max() < 0.2  # it went through, and not around
+    assert base[-1, 0] < -0.6 and after.part_free_percent == 100
+
+
+def test_a_doorway_that_is_too_narrow_is_named() -> None:
+    d = scenes.doorway(0.65, samples=40)
+    words = (
+        r"manipulate.*in collision with the map \(too narrow: 0\.6[0-9] m between obstacles, the base needs 0\.66 m\)"
+    )
+    with pytest.raises(InfeasibleError, match=words):
+        adapt([d], scenes.platform(0.005), config=AdaptConfig(rounds=0))
+
+
+def test_the_searches_cost_what_the_edges_cost() -> None:
+    """They look values up in another way."""
+    shown, platform = scenes.demonstrations("room_door", 2, samples=50), scenes.platform()
+    g = grasps.ranked(shown[0].handle, platform, calibration.typical_hands(shown) @ DEFAULT_HAND_TOOL)[0][1]
+    problem = prepare.stacked(shown, Calibration.default(), g, prepare.Obstacles(shown))
+    search = placement.Search(problem, platform, prepare.first_gripper(problem, g), platform.torso_rest)
+    around, steps = problem.surroundings[1], np.arange(50, 100, 7)
+    rng = np.random.default_rng(0)
+    near = prepare.first_base(shown[1], DEFAULT_TORSO_BASE)[steps - 50]
+    base = near[:, None] + rng.normal(size=(len(steps), 200, 3)) * [0.5, 0.5, 1]
+    flat, polygon, margin = base.reshape(-1, 3), platform.footprint, search.margin
+    points = np.vstack([outline(polygon, 0.12), outline(0.8 * polygon, 0.2), np.zeros((1, 2))])
+    radii = np.append(np.zeros(len(points) - 1), 0.33)
+    tool = np.repeat(search.gripper[steps], 200, axis=0)
+    short = edges.reach(platform.reachability, tool, flat, np.full(len(flat), platform.torso_rest), margin)[0]
+    met = edges.base_clearance(around.obstacles, points, radii, flat, margin)[0].max(axis=1)
+    hit = edges.panel_clearance(polygon, np.repeat(problem.panel[steps], 200, axis=0), flat, margin)[0].max(axis=1)
+    expected = sum(np.minimum((e / 0.02) ** 2, 400) for e in (short[:, 0], met, hit))
+    assert all((e > 0).any() for e in (short, met, hit))
+    for _ in range(2):  # the second time from memory
+        np.testing.assert_allclose(search.costs(around, steps, base).ravel(), expected, atol=1e-9)
+
+
 def test_margins_are_tightened_where_the_surrogate_is_wrong() -> None:
     """The exact reach ends 4 cm before what the optimiser sees."""
     shown = scenes.demonstrations("room_door", 1, samples=50)
@@ -154,6 +204,58 @@ def test_a_teacher_who_is_too_fast_is_slowed_down() -> None:
     assert 2 < stretch < 6
     with pytest.raises(InfeasibleError, match=r"limits \d+ %"):
         adapt([fast], scenes.platform(0.005), config=AdaptConfig(slow_down=False, rounds=0))
+
+
+def _with_arm(velocity: float, acceleration: float, broken: int | None = None) -> Platform:
+    """A platform whose arm is read off the gripper: two joints that go as it does, east and up, and turn with it."""
+
+    def path(T: np.ndarray, torso: np.ndarray, times_s: np.ndarray, *, thorough: bool) -> JointPath:
+        linked = np.ones(len(T) - 1, bool)
+        if broken is not None:
+            linked[broken] = False
+        return JointPath(4 * T[:, 1:3, 3], np.ones(len(T), bool), linked)
+
+    return replace(scenes.platform(0.005), arm=Arm(np.full(2, velocity), np.full(2, acceleration), path))
+
+
+def test_joints_that_are_too_fast_slow_the_clock_down_where_they_are() -> None:
+    d = scenes.demonstration("swivel_door", seed=3, samples=50)
+    fast, slow = _with_arm(100.0, 1e4), _with_arm(1.0, 6.0)
+    one, other = adapt([d], fast), adapt([d], slow)
+    a, b = one.demonstrations[0], other.demonstrations[0]
+    np.testing.assert_allclose(a.T_world_tool, b.T_world_tool)  # the same way
+    factor = np.diff(b.times_s) / np.diff(a.times_s)
+    assert factor.max() > 1.2 and factor.min() == pytest.approx(1)
+    assert any("its clock runs" in note for note in other.report.notes)
+    before, after = metrics.evaluate([d], other, slow).values()
+    assert before.joints_within_percent < 95 and before.joint_speed_percent > 120
+    assert after.joints_within_percent == 100 and 80 < after.joint_speed_percent <= 100
+    assert after.within_limits_percent == 100
+    late = metrics.evaluate([d], replace(other, demonstrations=(replace(b, times_s=a.times_s),)), slow)["after"]
+    assert late.joints_within_percent < 100 and late.joint_speed_percent > 100
+
+
+def test_an_arm_that_must_let_go_of_its_posture_is_noted() -> None:
+    d, platform = scenes.demonstration("drawer", seed=3, samples=50), _with_arm(100.0, 1e4, broken=20)
+    result = adapt([d], platform)
+    assert "no continuous motion of the arm was found after samples 20" in result.report.notes
+    assert metrics.evaluate([d], result, platform)["after"].joints_within_percent == pytest.approx(100 * 48 / 49)
+
+
+def test_a_clock_that_keeps_all_limits() -> None:
+    """Random motions: nothing is too fast afterwards, nothing got faster, what was slow enough is left alone."""
+    rng = np.random.default_rng(0)
+    times = np.cumsum(rng.uniform(0.05, 0.15, 80))
+    x = np.cumsum(0.02 * rng.normal(size=(80, 3)), axis=0)
+    x[40:43, 0] += [0.3, 0.6, 0.6]
+    motion = Motion(np.diff(x, axis=0), np.array([1.0, 1.5, np.inf]), np.array([10.0, np.inf, 12.0]))
+    assert max(s.max() for s in motion.shares(np.diff(times))) > 3
+    slower = retimed(motion, times, 50.0)
+    assert max(s.max() for s in motion.shares(np.diff(slower))) <= 1
+    assert (np.diff(slower) >= np.diff(times) - 1e-12).all() and slower[0] == times[0]
+    assert np.diff(slower).sum() < 6 * np.diff(times).sum()
+    np.testing.assert_array_equal(retimed(motion, slower, 50.0), slower)
+    assert np.diff(retimed(motion, times, 1.5)).max() <= 1.5 * np.diff(times).max() + 1e-12
 
 
 def test_no_torso_and_no_hand_on_the_object() -> None:
@@ -202,7 +304,7 @@ def test_no_room_for_the_base() -> None:
     state[state == FREE] = OCCUPIED
     d = replace(d, map=replace(d.map, state=state))
     with pytest.raises(
-        InfeasibleError, match=r"samples \d+ to \d+ .*in collision with the map; .*fight there: .*map \d+ %"
+        InfeasibleError, match=r"samples \d+ to \d+ .*in collision with the map \(too narrow: 0\.00 m .*; .*map \d+ %"
     ):
         adapt([d], scenes.platform(), config=AdaptConfig(rounds=1))
 
@@ -329,6 +431,13 @@ def test_results_come_back(room_door: tuple[list[Demonstration], AdaptationResul
     assert (back.task, back.robot) == (result.task, result.robot)
     np.testing.assert_array_equal(back.grasp, result.grasp)
     assert back.report.convergence.iterations == result.report.convergence.iterations
+    assert all(b.joints is None for b in back.demonstrations)
+    path = JointPath(np.zeros((60, 2)), np.ones(60, bool), np.arange(59) > 3)
+    storage.save(tmp_path / "arm", replace(result, demonstrations=(replace(result.demonstrations[0], joints=path),)))
+    arm = storage.load(tmp_path / "arm").demonstrations[0].joints
+    assert arm is not None
+    np.testing.assert_array_equal(arm.linked, path.linked)
+    assert arm.q.shape == (60, 2) and arm.exact.all()
     for a, b in zip(result.demonstrations, back.demonstrations, strict=True):
         np.testing.assert_array_equal(a.T_world_tool, b.T_world_tool)
         np.testing.assert_array_equal(a.achievable, b.achievable)
@@ -403,3 +512,21 @@ def test_what_cannot_be_adapted_together_is_left_out(monkeypatch: pytest.MonkeyP
     assert result.report == [d.task for d, side in zip(shown, sides, strict=True) if side == larger]
     assert left_out.keys() == {i for i, side in enumerate(sides) if side != larger}
     assert [len(t) for t in tried] == [4, 1, 1, 1, 1, sides.count(larger)]
+
+
+def test_the_one_that_spoils_it_for_the_others_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All are feasible alone, but not with number 2, at which most samples fail."""
+    shown = [replace(scenes.demonstration("drawer", seed, samples=40), task=str(seed)) for seed in range(4)]
+
+    def not_with_two(demonstrations: list[Demonstration], *args: object, **options: object) -> AdaptationResult:
+        tasks = [d.task for d in demonstrations]
+        if len(tasks) > 1 and "2" in tasks:
+            raise InfeasibleError("they fight", {0: 1, tasks.index("2"): 5})
+        result = object.__new__(AdaptationResult)
+        object.__setattr__(result, "report", tasks)
+        return result
+
+    monkeypatch.setattr(most, "adapt", not_with_two)
+    result, left_out = most.adapt_most(shown, scenes.platform())
+    assert result.report == ["0", "1", "3"]
+    assert left_out == {2: "cannot be adapted together with the others that were kept"}

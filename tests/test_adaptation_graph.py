@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from understudy import lie
 from understudy.adaptation import edges, fields, prepare
+from understudy.adaptation import problem as problems
 from understudy.adaptation.calibration import DEFAULT_HAND_TOOL, DEFAULT_TORSO_BASE, Calibration
 from understudy.adaptation.graph import BASE, GRIPPER, TORSO, Graph, State
 from understudy.adaptation.solver import WIDTH, Chain, Linear, Stop, _Normal, costs_by_kind, minimise
@@ -67,6 +68,33 @@ def test_rigid_grasp_edge() -> None:
     _check(lambda d: edges.rigid_grasp(g @ lie.se3_exp(d[0]), obj, T)[0], Jg, 6)
     np.testing.assert_allclose(edges.rigid_grasp(g, obj, obj @ g)[0], 0, atol=1e-12)
     assert np.abs(e).max() > 0.1
+
+
+def test_a_mirrored_grasp_is_linearised_right() -> None:
+    """Of demonstrations of doors hung on either side: residuals of holding and of coming straight, over the grasp that
+    both share, against finite differences.
+    """
+    problem, state = _problem("room_door")
+    problem = replace(problem, mirrored=np.arange(len(problem.dt)) >= len(problem.dt) // 2)
+    state = state.retract(np.zeros((len(state.torso), WIDTH)), 0.2 * np.random.default_rng(0).normal(size=6))
+    graph = Graph(problem, scenes.platform())
+    for kind in ("rigid", "approach"):
+
+        def residual(shared: np.ndarray, kind: str = kind) -> np.ndarray:
+            moved = state.retract(np.zeros((len(state.torso), WIDTH)), shared)
+            return next(e.residual for e in graph.grasping(moved, FULL) if e.kind == kind)
+
+        border = next(e.border for e in graph.grasping(state, FULL) if e.kind == kind)
+        for column, unit in enumerate(STEP * np.eye(6)):
+            numeric = (residual(unit) - residual(-unit)) / (2 * STEP)
+            np.testing.assert_allclose(border[..., column], numeric, rtol=1e-5, atol=1e-3)  # whitened: thousands
+        steps = next(e.steps for e in graph.grasping(state, FULL) if e.kind == kind)
+        assert problem.mirrored[steps].any() and not problem.mirrored[steps].all()
+        assert np.abs(border[problem.mirrored[steps]]).max() > 10
+    # and the mirror image is one: reflected twice it is the grasp, and it is still a rotation
+    twice = problems.mirror(problems.mirror(state.grasp))
+    np.testing.assert_allclose(twice, state.grasp, atol=1e-15)
+    assert np.linalg.det(problems.mirror(state.grasp)[:3, :3]) == pytest.approx(1)
 
 
 def test_reach_edge() -> None:
@@ -161,6 +189,27 @@ def test_distance_field_is_the_distance() -> None:
         numeric = (field.at(points + shift)[0] - field.at(points - shift)[0]) / (2 * h)
         np.testing.assert_allclose(gradient[:, axis], numeric, atol=1e-5)
     assert field.at(np.array([[2.05, 2.55]]))[0][0] < 0
+
+
+def test_values_alone_are_the_values() -> None:
+    """What the searches look up without gradients."""
+    rng = np.random.default_rng(2)
+    for k in (2, 3):
+        field, points = _wavy(k), rng.uniform(-4, 4, (500, k))
+        np.testing.assert_array_equal(field.values_at(points), field.at(points)[0])
+    polygon = np.array([[0.4, -0.2], [0.3, 0.25], [-0.3, 0.2], [-0.3, -0.2]])
+    points = rng.uniform(-0.6, 0.6, (2000, 2))
+    value, gradient = fields.polygon_distance(polygon, points)
+    np.testing.assert_allclose(fields.polygon_values(polygon, *points.T), value, atol=1e-15)
+    smooth = np.abs(value) > 0.02  # the gradient jumps on the outline
+    h = 1e-6
+    for axis in range(2):
+        shift = h * np.eye(2)[axis]
+        numeric = (
+            fields.polygon_distance(polygon, points + shift)[0] - fields.polygon_distance(polygon, points - shift)[0]
+        )
+        close = np.abs(numeric / (2 * h) - gradient[:, axis]) < 1e-5
+        assert close[smooth].mean() > 0.995  # but at equal distances from two sides
 
 
 def test_no_obstacles_at_all() -> None:

@@ -21,6 +21,7 @@ from understudy.robot import urdf  # noqa: E402
 from understudy.robot.description import ROBOTS, RobotError, load_description  # noqa: E402
 from understudy.robot.field import label, load_field, train_field, training_poses  # noqa: E402
 from understudy.robot.ik import pose_distance, solve_ik  # noqa: E402
+from understudy.robot.ik_follow import follow_ik_path  # noqa: E402
 from understudy.robot.ik_path import solve_ik_path  # noqa: E402
 from understudy.robot.model import Robot, load_robot  # noqa: E402
 from understudy.robot.reachability import build_map, load_map, orientation_bins  # noqa: E402
@@ -258,6 +259,29 @@ def test_a_path_that_leaves_the_workspace_says_where(pr2: Robot) -> None:
     np.testing.assert_allclose(path.q[10:], np.tile(path.q[9], (10, 1)))
 
 
+def test_a_followed_path_is_exact_continuous_and_no_faster_than_the_thorough_one(robot: Robot) -> None:
+    t = 40
+    T, torso, times = arc(t, -1.0 if "left" in robot.name else 1.0), np.full(t, 0.1), np.arange(t) * 0.15
+    path, thorough = follow_ik_path(robot, T, torso, times), solve_ik_path(robot, T, torso, times)
+    assert path.success.all() and path.jumps == ()
+    assert path.position_error.max() <= 1e-4 and path.angle_error.max() <= 1e-3
+    assert not robot.collides(path.q, path.torso).any() and robot.within_limits(path.q, path.torso).all()
+    assert path.velocity_share.max() <= 1.05 * thorough.velocity_share.max()
+
+
+def test_a_followed_path_goes_on_beyond_a_gap(pr2: Robot) -> None:
+    """Samples in the middle that cannot be reached are no success; those after them are."""
+    T = arc(30)
+    T[12:15, 0, 3] += 2
+    path = follow_ik_path(pr2, T, np.full(30, 0.1), 0.2 * np.arange(30))
+    np.testing.assert_array_equal(path.success, ~np.isin(np.arange(30), [12, 13, 14]))
+    nowhere = T.copy()
+    nowhere[:, 0, 3] += 5
+    assert not follow_ik_path(pr2, nowhere, np.full(30, 0.1), 0.2 * np.arange(30)).success.any()
+    with pytest.raises(UnderstudyError, match="times that increase"):
+        follow_ik_path(pr2, T, np.full(30, 0.1), np.zeros(30))
+
+
 # reachability
 
 
@@ -280,7 +304,8 @@ def test_the_shipped_field_is_right_about_typical_poses(name: str, monkeypatch: 
 def test_the_fields_gradient_is_its_derivative(pr2: Robot) -> None:
     field = load_field(pr2)
     T, torso = training_poses(pr2, 300, 21)
-    _, d_pose, d_torso = field.distance(T, torso)
+    value, d_pose, d_torso = field.distance(T, torso)
+    np.testing.assert_allclose(field.value(T, torso), value, rtol=0, atol=1e-12)
     step = 1e-5
     for k in range(6):
         xi = np.zeros((len(T), 6))

@@ -8,16 +8,18 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
 from understudy import lie
 from understudy.adaptation import prepare
 from understudy.adaptation.calibration import Calibration
+from understudy.adaptation.clock import Motion, arm_motion, base_motion, gripper_motion, joined, retimed
 from understudy.adaptation.errors import InfeasibleError
 from understudy.adaptation.explain import conflicts, energies_over_time
 from understudy.adaptation.fields import collision_free
 from understudy.adaptation.graph import Graph, Problem, State
-from understudy.adaptation.platform import Platform
+from understudy.adaptation.parts import beside_part, object_path, panel_path
+from understudy.adaptation.platform import JointPath, Platform
 from understudy.adaptation.result import AdaptationResult, Adapted, Report
 from understudy.adaptation.solver import Chain, Convergence, Iteration, Stop, Stopwatch, minimise
 from understudy.adaptation.start import Starts
@@ -31,11 +33,13 @@ if TYPE_CHECKING:
 _LOOSE: Final = 0.002  # metres and radians: a grasp that is missed by more is none
 _EXACT: Final = 0.0005  # the same, of a good one
 _NEARLY: Final = 0.93  # of a limit: where its edges begin to push
-_SLOWER: Final = 1.15  # least factor by which the clock is slowed down further
+_SLOWER: Final = (1.15, 1.5)  # least and greatest factor by which the clock is slowed down at a time
 _SLOWEST: Final = 5.0  # times the demonstration's clock: beyond, time is not what is short
+_NOTED: Final = 1.005  # a clock that runs so many times as long is worth a note
 _AROUND: Final = 3  # samples beside a failure whose margins are tightened, too
 _REACH_STEP: Final = 0.015  # metres by which margins are tightened
 _OBSTACLE_STEP: Final = 0.01
+_STIFFER: Final = 1.5  # factor on the map's edges where the base is not clear of it
 _MOST_OBSTACLE: Final = 0.02  # in all: more would close doorways
 
 
@@ -93,14 +97,35 @@ def _check(demonstrations: Sequence[Demonstration]) -> None:
             raise UnderstudyError(f"adapt: demonstration {i}: the hand never takes hold (segments.grasp at the end)")
 
 
+@dataclass(frozen=True, eq=False)
+class _Checked:
+    """A state, and what the exact checks say about it."""
+
+    state: State
+    free: Bool[np.ndarray, " n"]
+    """exactly clear of each demonstration's map"""
+    beside: Bool[np.ndarray, " n"]
+    """the base is not where the moving part is"""
+    achieved: Bool[np.ndarray, " n"]
+    """by exact inverse kinematics"""
+    joints: tuple[JointPath | None, ...]
+    """per demonstration"""
+
+    @property
+    def clear(self) -> Bool[np.ndarray, " n"]:
+        """The base hits nothing."""
+        return self.free & self.beside
+
+
 class _Adaptation:
     """One call of `adapt`."""
 
     def __init__(self, demonstrations: tuple[Demonstration, ...], platform: Platform, config: AdaptConfig):
         self.demonstrations, self.platform, self.config = demonstrations, platform, config
         self.obstacles = prepare.Obstacles(demonstrations)
+        self.panels = [panel_path(d, object_path(d)) for d in demonstrations]
         self.notes: list[str] = []
-        self.slower = 1.0
+        self.slower = np.ones(len(demonstrations))
 
     def run(self) -> AdaptationResult:
         """The whole course."""
@@ -117,67 +142,80 @@ class _Adaptation:
             course += part
             if number + 1 < len(self.config.schedule):
                 graph.with_grasp(start.family.nearest(state.grasp))
-        state, rounds, part, converged = self.tighten(graph, state, converged)
+        found, rounds, part, converged = self.tighten(graph, state, converged)
         course += part
-        state = self.tidied(state)
-        free, achieved = self.free(state), self.achievable(state)
-        self.refuse(graph, state, free, achieved)
-        self.note_speeds(graph, state)
+        self.refuse(graph, found)
         if not converged:
             self.notes.append("the solver stopped at its limit of iterations")
+        adapted = self.parts(graph, found)
         report = Report(Convergence(tuple(course), converged, *watch.read()), rounds, tuple(self.notes))
-        adapted = self.parts(graph, state, free, achieved)
         first = self.demonstrations[0]
         return AdaptationResult(first.task, self.platform.name, adapted, graph.problem.grasp, start.calibration, report)
 
     def clocked(self, problem: Problem) -> Problem:
-        """The problem, on a clock that is slow enough for the gripper to go with the part."""
+        """The problem, on clocks that are slow enough for the gripper to go with the part."""
         if self.config.slow_down:
-            limits, share = self.config.limits, self.config.margins.speed
-            speed, turning = prepare.needed_speeds(problem)
-            self.slower = max(1.0, speed / (share * limits.speed), turning / (share * limits.turning))
-        return replace(problem, dt=self.slower * problem.dt)
+            limits = self.config.margins.speed * np.array([self.config.limits.speed, self.config.limits.turning])
+            self.slower = np.maximum(1.0, (prepare.needed_speeds(problem) / limits).max(axis=1))
+        return replace(problem, dt=self.per_step(self.slower) * problem.dt)
 
-    def tighten(self, graph: Graph, state: State, converged: bool) -> tuple[State, int, list[Iteration], bool]:
+    def per_step(self, values: Float[np.ndarray, " d"]) -> Float[np.ndarray, " n"]:
+        """Values of demonstrations for each step of the chain."""
+        return np.repeat(values, [len(d) for d in self.demonstrations])
+
+    def tighten(self, graph: Graph, state: State, converged: bool) -> tuple[_Checked, int, list[Iteration], bool]:
         """Larger margins where exact checks fail, and the last stage again, until nothing fails."""
         course: list[Iteration] = []
         stage = self.config.schedule[-1]
         for round in range(self.config.rounds):
-            tidy = self.tidied(state)
-            free, achieved = self.free(tidy), self.achievable(tidy)
-            good = free.all() and achieved.mean() >= self.config.target_achievable
-            late = self.late(graph, tidy)
-            if good and not late:
-                return state, round, course, converged
-            if late:
-                self.slower *= late
-                graph.stretch(late)
-            graph.reach_margin[_widened(~achieved)] += _REACH_STEP
-            if not free.all() and graph.obstacle_margin < self.config.margins.obstacle + _MOST_OBSTACLE:
+            found = self.checked(state)
+            late = self.late(graph, found)
+            good = found.clear.all() and found.achieved.mean() >= self.config.target_achievable
+            if good and (late == 1).all():
+                return found, round, course, converged
+            self.slower *= late
+            graph.stretch(self.per_step(late))
+            graph.reach_margin[_widened(~found.achieved)] += _REACH_STEP
+            graph.map_stiffness[_widened(~found.free)] *= _STIFFER
+            graph.part_stiffness[_widened(~found.beside)] *= _STIFFER
+            if not found.free.all() and graph.obstacle_margin < self.config.margins.obstacle + _MOST_OBSTACLE:
                 graph.obstacle_margin += _OBSTACLE_STEP
             state, part, converged = _solve(graph, state, stage, len(self.config.schedule) + round)
             course += part
-        return state, self.config.rounds, course, converged
+        return self.checked(state), self.config.rounds, course, converged
 
-    def late(self, graph: Graph, state: State) -> float:
-        """By how much to slow down further: 0 where the robot keeps up and does not miss its grasp for lack of time."""
-        over = graph.excess(state)
-        short_of_time = over > 1 or (over > _NEARLY and max(graph.missed(state)) > _EXACT)
-        factor = min(max(over, _SLOWER), _SLOWEST / self.slower)
-        return factor if self.config.slow_down and short_of_time and factor > 1 else 0.0
+    def late(self, graph: Graph, found: _Checked) -> Float[np.ndarray, " d"]:
+        """By how much to slow down further: 1 where no grasp is missed and nothing is hit for lack of time."""
+        over = graph.excess(found.state)
+        failed = np.array([not found.clear[s].all() for s, _ in self.each()])
+        failed |= graph.missed(found.state).max(axis=1) > _EXACT
+        factor = np.minimum(np.clip(over, *_SLOWER), _SLOWEST / self.slower)
+        return np.where(failed & (over > _NEARLY) & self.config.slow_down, np.maximum(factor, 1.0), 1.0)
 
-    def tidied(self, state: State) -> State:
-        """The torso within its range to the last digit."""
-        return replace(state, torso=np.clip(state.torso, *self.platform.torso_limits))
-
-    def free(self, state: State) -> Bool[np.ndarray, " n"]:
-        """Exactly clear of each demonstration's map."""
-        return np.concatenate([collision_free(d.map, self.platform.footprint, state.base[s]) for s, d in self.each()])
-
-    def achievable(self, state: State) -> Bool[np.ndarray, " n"]:
-        """By exact inverse kinematics."""
+    def checked(self, state: State) -> _Checked:
+        """Exact checks. A joint path proves what it goes through; only the rest is left to inverse kinematics."""
+        state = replace(state, torso=np.clip(state.torso, *self.platform.torso_limits))  # to the last digit
+        free = [collision_free(d.map, self.platform.footprint, state.base[s]) for s, d in self.each()]
+        beside = [
+            beside_part(panel, self.platform.footprint, state.base[s])
+            for panel, (s, _) in zip(self.panels, self.each(), strict=True)
+        ]
         seen = lie.se3_inverse(lie.se2_to_se3(state.base)) @ state.gripper
-        return self.platform.achievable(seen, state.torso)
+        joints = tuple(self.joints(seen[s], state.torso[s], d.times_s) for s, d in self.each())
+        achieved = np.concatenate(
+            [np.zeros(len(d), bool) if j is None else j.exact for j, d in zip(joints, self.demonstrations, strict=True)]
+        )
+        rest = np.flatnonzero(~achieved)
+        if len(rest):
+            achieved[rest] = self.platform.achievable(seen[rest], state.torso[rest])
+        return _Checked(state, np.concatenate(free), np.concatenate(beside), achieved, joints)
+
+    def joints(
+        self, T: Float[np.ndarray, "t 4 4"], torso: Float[np.ndarray, " t"], times_s: np.ndarray, thorough: bool = False
+    ) -> JointPath | None:
+        """Of the arm, along one demonstration (base frame)."""
+        arm = self.platform.arm
+        return None if arm is None else arm.path(T, torso, times_s, thorough=thorough)
 
     def each(self) -> list[tuple[slice, Demonstration]]:
         """Demonstrations with their steps in the chain."""
@@ -185,45 +223,69 @@ class _Adaptation:
         steps = [slice(int(a), int(b)) for a, b in pairwise(ends)]
         return list(zip(steps, self.demonstrations, strict=True))
 
-    def parts(self, graph: Graph, state: State, free: np.ndarray, achieved: np.ndarray) -> tuple[Adapted, ...]:
-        """The result of each demonstration."""
+    def parts(self, graph: Graph, found: _Checked) -> tuple[Adapted, ...]:
+        """The result of each demonstration, and notes about clocks and joints."""
+        state, problem = found.state, graph.problem
         energies = energies_over_time(graph, state, self.config.schedule[-1])
-        return tuple(
-            Adapted(
-                d.times_s[0] + self.slower * (d.times_s - d.times_s[0]),
-                state.gripper[s],
-                state.base[s],
-                state.torso[s],
-                achieved[s],
-                free[s],
-                graph.problem.grasps(graph.problem.grasp, np.array([s.start]))[0][0],
-                {kind: values[s] for kind, values in energies.items()},
-            )
-            for s, d in self.each()
-        )
+        seen = lie.se3_inverse(lie.se2_to_se3(state.base)) @ state.gripper
+        out = []
+        for (s, d), slower, joints in zip(self.each(), self.slower, found.joints, strict=True):
+            if joints is not None and not joints.linked.all():
+                joints = self.joints(seen[s], state.torso[s], d.times_s, thorough=True)
+            times = d.times_s[0] + slower * (d.times_s - d.times_s[0])
+            if self.config.slow_down:
+                times = retimed(self.motion(state, s, joints), times, _SLOWEST)
+            grasp = problem.grasps(problem.grasp, np.array([s.start]))[0][0]
+            costs = {kind: values[s] for kind, values in energies.items()}
+            tool, base, torso = state.gripper[s], state.base[s], state.torso[s]
+            out.append(Adapted(times, tool, base, torso, found.achieved[s], found.free[s], grasp, costs, joints))
+        self.note(state, out)
+        return tuple(out)
 
-    def note_speeds(self, graph: Graph, state: State) -> None:
-        """Says so where the robot is slower than the teacher, or cannot keep up: holding on goes before limits."""
-        name = self.platform.name
-        if self.slower > 1:
-            self.notes.append(f"the teacher moved too fast for {name}: its clock runs {self.slower:.2f} times as long")
-        over = graph.excess(state)
+    def motion(self, state: State, steps: slice, joints: JointPath | None) -> Motion:
+        """Of everything that has limits, in one demonstration."""
+        parts = [
+            base_motion(self.platform, state.base[steps], state.torso[steps]),
+            gripper_motion(self.config.limits, state.gripper[steps]),
+        ]
+        return joined(*parts, *([] if joints is None else [arm_motion(self.platform, joints)]))
+
+    def note(self, state: State, adapted: Sequence[Adapted]) -> None:
+        """Says so where the robot is slower than the teacher, cannot keep up, or its arm has to change its posture."""
+        name, several = self.platform.name, len(adapted) > 1
+        slower = [np.ptp(a.times_s) / np.ptp(d.times_s) for a, d in zip(adapted, self.demonstrations, strict=True)]
+        late = sorted(x for x in slower if x > _NOTED)
+        if late:
+            factor = f"{late[0]:.2f} to {late[-1]:.2f}" if late[-1] > _NOTED * late[0] else f"{late[-1]:.2f}"
+            where = f" in {len(late)} of {len(adapted)} demonstrations" if several else ""
+            self.notes.append(f"{name} is slower than the teacher: its clock runs {factor} times as long{where}")
+        over = 0.0
+        for i, ((s, _), a) in enumerate(zip(self.each(), adapted, strict=True)):
+            over = max(over, *(x.max(initial=0.0) for x in self.motion(state, s, a.joints).shares(np.diff(a.times_s))))
+            if a.joints is not None and not a.joints.linked.all():
+                at = ", ".join(map(str, np.flatnonzero(~a.joints.linked).tolist()[:6]))
+                which = f"demonstration {i}: " if several else ""
+                self.notes.append(f"{which}no continuous motion of the arm was found after samples {at}")
         if over > 1:
             self.notes.append(f"up to {over:.2f} times as fast as {name} can go")
 
-    def refuse(self, graph: Graph, state: State, free: np.ndarray, achieved: np.ndarray) -> None:
+    def refuse(self, graph: Graph, found: _Checked) -> None:
         """Raises InfeasibleError for a result that the robot cannot do; notes what it can nearly do."""
-        off, turned = graph.missed(state)
+        clear, achieved = found.clear, found.achieved
+        off, turned = graph.missed(found.state).max(axis=0)
         held = max(off, turned) <= _LOOSE
-        if held and free.all() and achieved.mean() >= self.config.least_achievable:
+        if held and clear.all() and achieved.mean() >= self.config.least_achievable:
             if achieved.mean() < self.config.target_achievable:
                 self.notes.append(f"{100 * achieved.mean():.2f} % of the samples are achievable")
             return
+        good = clear & achieved
+        failing = {i: int((~good[s]).sum()) for i, (s, _) in enumerate(self.each()) if not good[s].all()}
         raise InfeasibleError(
             f"{self.demonstrations[0].task}: no trajectory of {self.platform.name} keeps all constraints "
-            f"(achievable {100 * achieved.mean():.1f} %, clear of the map {100 * free.mean():.1f} %, "
-            f"grasp missed by {100 * off:.2f} cm).\n"
-            + conflicts(graph, state, self.config.schedule[-1], self.each(), free, achieved)
+            f"(achievable {100 * achieved.mean():.1f} %, clear of the map {100 * found.free.mean():.1f} %, "
+            f"of the moving part {100 * found.beside.mean():.1f} %, grasp missed by {100 * off:.2f} cm).\n"
+            + conflicts(graph, found.state, self.config.schedule[-1], self.each(), found.free, found.beside, achieved),
+            failing,
         )
 
 

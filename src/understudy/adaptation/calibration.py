@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from jaxtyping import Float
@@ -79,9 +80,19 @@ def hands_on_object(demonstration: Demonstration) -> Float[np.ndarray, "n 4 4"]:
 
 def typical_hands(demonstrations: Sequence[Demonstration]) -> Float[np.ndarray, "d 4 4"]:
     """The mean hand in the object's frame of every demonstration that shows one."""
-    shown = [hands_on_object(d) for d in demonstrations]
-    means = [mean_pose(T) for T in shown if len(T)]
-    return np.array(means) if means else np.zeros((0, 4, 4))
+    means = [_typical_hand(d) for d in demonstrations]
+    return np.concatenate(means) if means else np.zeros((0, 4, 4))
+
+
+_typical: WeakKeyDictionary[Demonstration, Float[np.ndarray, "_ 4 4"]] = WeakKeyDictionary()
+
+
+def _typical_hand(demonstration: Demonstration) -> Float[np.ndarray, "_ 4 4"]:
+    """One mean hand, or none; kept, for it is asked for with every grasp that is tried."""
+    if demonstration not in _typical:
+        shown = hands_on_object(demonstration)
+        _typical[demonstration] = mean_pose(shown)[None] if len(shown) else np.zeros((0, 4, 4))
+    return _typical[demonstration]
 
 
 def typical_tools(demonstrations: Sequence[Demonstration], calibration: Calibration) -> Float[np.ndarray, "d 4 4"]:

@@ -75,7 +75,7 @@ def reach(
     value, d_pose, d_torso = field.distance(T_base_tool, torso)
     # moving the base by Exp(d) moves the tool, seen from the base, by Exp(-d) on the left
     seen = -(d_pose[:, None] @ lie.se3_adjoint(lie.se3_inverse(T_base_tool)))[:, 0, [0, 1, 5]]
-    e, on = _hinge(value + margin, SOFT_M)
+    e, on = hinge(value + margin, SOFT_M)
     return e[:, None], (on[:, None] * d_pose)[:, None], (on[:, None] * seen)[:, None], (on * d_torso)[:, None, None]
 
 
@@ -95,7 +95,7 @@ def base_clearance(
     base, turn = base[near], _turns(base[near])
     world = base[:, None, :2] + points @ np.swapaxes(turn, 1, 2)
     d, gradient = field.at(world.reshape(-1, 2))
-    e[near], on = _hinge(radii + margin - d.reshape(-1, k), SOFT_M)
+    e[near], on = hinge(radii + margin - d.reshape(-1, k), SOFT_M)
     local = gradient.reshape(-1, k, 2) @ turn
     yaw = points[:, 0] * local[..., 1] - points[:, 1] * local[..., 0]
     J[near] = -on[..., None] * np.concatenate([local, yaw[..., None]], axis=2)
@@ -133,7 +133,7 @@ def map_clearance(
     order = np.lexsort((-d, keys))
     last = order[np.append(keys[order][1:] != keys[order][:-1], True)] if len(order) else order
     rows, sides = near[pose[close[last]]], side[last]
-    e[rows, sides], on = _hinge(0.5 * map.resolution_m + margin - d[last], SOFT_M)
+    e[rows, sides], on = hinge(0.5 * map.resolution_m + margin - d[last], SOFT_M)
     g, p = gradient[last], local[close[last]]
     # moving the base by d moves the cell, seen from the base, by -d
     yaw = g[:, 1] * p[:, 0] - g[:, 0] * p[:, 1]
@@ -154,15 +154,15 @@ def panel_clearance(
     n, m = panel.shape[:2]
     e, J = np.zeros((n, m)), np.zeros((n, m, 3))
     far = float(np.linalg.norm(polygon, axis=1).max()) + margin + SOFT_M
-    away = np.where(np.isfinite(panel), panel - base[:, None, :2], 1e3)
-    near = np.flatnonzero((np.sum(away**2, axis=2) < far**2).any(axis=1))
-    local = away[near] @ _turns(base[near])
-    d, gradient = polygon_distance(polygon, local.reshape(-1, 2))
-    e[near], on = _hinge(margin - d.reshape(-1, m), SOFT_M)
-    gradient = gradient.reshape(-1, m, 2)
+    away = panel - base[:, None, :2]
+    with np.errstate(invalid="ignore"):  # NaN: no point
+        pose, point = np.nonzero(np.sum(away**2, axis=2) < far**2)
+    local = np.einsum("mi,mij->mj", away[pose, point], _turns(base)[pose])
+    d, gradient = polygon_distance(polygon, local)
+    e[pose, point], on = hinge(margin - d, SOFT_M)
     # moving the base by d moves the point, seen from the base, by -d
-    yaw = gradient[..., 1] * local[..., 0] - gradient[..., 0] * local[..., 1]
-    J[near] = on[..., None] * np.concatenate([gradient, yaw[..., None]], axis=2)
+    yaw = gradient[:, 1] * local[:, 0] - gradient[:, 0] * local[:, 1]
+    J[pose, point] = on[:, None] * np.column_stack([gradient, yaw])
     return e, J
 
 
@@ -177,7 +177,7 @@ def gripper_clearance(
     R = T[:, :3, :3]
     world = T[:, None, :3, 3] + points @ np.swapaxes(R, 1, 2)
     d, gradient = field.at(world.reshape(-1, 3))
-    e, on = _hinge(radius - d.reshape(n, k), SOFT_M)
+    e, on = hinge(radius - d.reshape(n, k), SOFT_M)
     local = gradient.reshape(n, k, 3) @ R
     turning = np.cross(np.broadcast_to(points, local.shape), local)
     return e, -on[..., None] * np.concatenate([local, turning], axis=2)
@@ -194,7 +194,7 @@ def beyond(
 def longer(x: Float[np.ndarray, "n k"], limit: float) -> tuple[Float[np.ndarray, "n 1"], Float[np.ndarray, "n 1 k"]]:
     """How much longer than the limit each vector is, and the Jacobian over the vector."""
     length = np.linalg.norm(x, axis=1)
-    e, on = _hinge(length - limit)
+    e, on = hinge(length - limit)
     return e[:, None], (on[:, None] * x / np.maximum(length, 1e-12)[:, None])[:, None]
 
 
@@ -204,7 +204,7 @@ def _turns(base: np.ndarray) -> Float[np.ndarray, "n 2 2"]:
     return np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], 1)
 
 
-def _hinge(x: np.ndarray, soft: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+def hinge(x: np.ndarray, soft: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
     """max(0, x) and its derivative; within +-soft a parabola, so that the solver feels a limit before it is there."""
     if not soft:
         return np.maximum(x, 0.0), (x > 0).astype(np.float64)

@@ -48,6 +48,20 @@ class DistanceField:
         gradient = np.stack([s[()] for s in slopes], axis=1)
         return corners[()], np.where(inside, gradient, 0.0) / self.cell_m
 
+    def values_at(self, points: Float[np.ndarray, "n k"]) -> Float[np.ndarray, " n"]:
+        """Distances alone, in a third of the time."""
+        place = (points - self.origin) / self.cell_m
+        low = np.clip(np.floor(place), 0, np.array(self.values.shape) - 2)
+        share = np.clip(place - low, 0, 1)
+        strides = np.array(self.values.strides) // self.values.itemsize
+        flat, first = self.values.reshape(-1), (low @ strides).astype(np.int64)
+        corners = {c: flat[first + int(np.dot(c, strides))] for c in product((0, 1), repeat=points.shape[1])}
+        for axis in range(points.shape[1]):
+            f = share[:, axis]
+            rest = [c[1:] for c in corners if c[0] == 0]
+            corners = {c: corners[0, *c] + f * (corners[1, *c] - corners[0, *c]) for c in rest}
+        return corners[()]
+
 
 def signed_distance(
     blocked: Bool[np.ndarray, "..."], origin: Float[np.ndarray, " k"], cell_m: float, pad_m: float = _PAD_M
@@ -107,18 +121,43 @@ def polygon_distance(
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 2"]]:
     """Signed distances (negative inside) of points to a convex polygon, and gradients over the points."""
     normals, offsets = half_planes(polygon)
-    height = points @ normals.T - offsets
-    best = np.argmax(height, axis=1)
-    inside = height.max(axis=1) <= 0
-    edge = np.roll(polygon, -1, axis=0) - polygon
-    share = np.einsum("nki,ki->nk", points[:, None] - polygon, edge) / np.sum(edge**2, axis=1)
-    away = points[:, None] - polygon - np.clip(share, 0, 1)[..., None] * edge
-    length = np.linalg.norm(away, axis=2)
-    nearest = np.argmin(length, axis=1)
-    rows = np.arange(len(points))
-    outward = away[rows, nearest] / np.maximum(length[rows, nearest], 1e-12)[:, None]
-    value = np.where(inside, height[rows, best], length[rows, nearest])
-    return value, np.where(inside[:, None], normals[best], outward)
+    x, y = points.T
+    height, squared = np.full(len(x), -np.inf), np.full(len(x), np.inf)
+    inward, away = np.zeros((len(x), 2)), np.zeros((len(x), 2))
+    for a, b, n, c in zip(polygon, np.roll(polygon, -1, axis=0), normals, offsets, strict=True):
+        h = n[0] * x + n[1] * y - c
+        higher = h > height
+        height[higher], inward[higher] = h[higher], n
+        dx, dy = _from_edge(x, y, a, b)
+        d = dx**2 + dy**2
+        nearer = d < squared
+        squared[nearer] = d[nearer]
+        away[nearer, 0], away[nearer, 1] = dx[nearer], dy[nearer]
+    length, inside = np.sqrt(squared), height <= 0
+    gradient = np.where(inside[:, None], inward, away / np.maximum(length, 1e-12)[:, None])
+    return np.where(inside, height, length), gradient
+
+
+def _from_edge(
+    x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"], a: Float[np.ndarray, "2"], b: Float[np.ndarray, "2"]
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """From the nearest point of the edge a to b to each point."""
+    dx, dy, edge = x - a[0], y - a[1], b - a
+    share = np.clip((edge[0] * dx + edge[1] * dy) / (edge @ edge), 0, 1)
+    return dx - share * edge[0], dy - share * edge[1]
+
+
+def polygon_values(
+    polygon: Float[np.ndarray, "k 2"], x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"]
+) -> Float[np.ndarray, " n"]:
+    """The values of `polygon_distance` alone, many times faster."""
+    normals, offsets = half_planes(polygon)
+    height, squared = np.full(len(x), -np.inf), np.full(len(x), np.inf)
+    for a, b, n, c in zip(polygon, np.roll(polygon, -1, axis=0), normals, offsets, strict=True):
+        np.maximum(height, n[0] * x + n[1] * y - c, out=height)
+        dx, dy = _from_edge(x, y, a, b)
+        np.minimum(squared, dx**2 + dy**2, out=squared)
+    return np.where(height <= 0, height, np.sqrt(squared))
 
 
 def collision_free(

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from understudy.adaptation import edges
+from understudy.adaptation.clock import base_motion, gripper_motion, joined
 from understudy.adaptation.fields import half_planes
 from understudy.adaptation.platform import Platform
 from understudy.adaptation.problem import BASE, GRIPPER, TORSO, Problem, State, Surroundings
@@ -49,6 +50,7 @@ class Graph:
         self.weights, self.margins, self.limits = weights or Weights(), margins or Margins(), limits or Limits()
         self.reach_margin = np.full(len(problem.dt), self.margins.reach)
         self.obstacle_margin = self.margins.obstacle
+        self.map_stiffness, self.part_stiffness = np.ones((2, len(problem.dt)))
         self._inradius = max(float(half_planes(platform.footprint)[1].min()), 0.0)
         self._hand = np.flatnonzero(np.isfinite(problem.hand).all(axis=(1, 2)))
         self._torso = np.flatnonzero(np.isfinite(problem.torso).all(axis=1))
@@ -68,34 +70,30 @@ class Graph:
         """Chooses another feasible grasp."""
         self.problem = replace(self.problem, grasp=grasp)
 
-    def stretch(self, factor: float) -> None:
-        """Slows the clock down."""
+    def stretch(self, factor: Float[np.ndarray, " n"]) -> None:
+        """Slows the clock down, per step."""
         self.problem = replace(self.problem, dt=factor * self.problem.dt)
 
-    def excess(self, state: State) -> float:
-        """Greatest velocity or acceleration over its limit, of base, torso and gripper: 1 is just kept."""
-        a, t = self._pairs, self._triples
-        dt = self.problem.dt[a][:, None]
-        v = edges.between_poses(state.gripper[a], state.gripper[a + 1])[0] / dt
-        u = edges.between_planar(state.base[a], state.base[a + 1])[0] / dt
-        first = np.searchsorted(a, t)
-        change = (u[first + 1] - u[first]) / (0.5 * (dt[first] + dt[first + 1]))
-        lift = np.diff(state.torso)[a] / dt[:, 0]
-        ratios = (
-            np.linalg.norm(v[:, :3], axis=1) / self.limits.speed,
-            np.linalg.norm(v[:, 3:], axis=1) / self.limits.turning,
-            np.abs(u) / self.platform.base_velocity,
-            np.abs(change) / self.platform.base_acceleration,
-            np.abs(lift) / self.platform.torso_velocity,
-        )
-        return float(max(r.max(initial=0.0) for r in ratios))
+    def excess(self, state: State) -> Float[np.ndarray, " d"]:
+        """Greatest velocity or acceleration of base, torso and gripper over its limit, per demonstration: 1 is just
+        kept.
+        """
+        out = []
+        for s in self.problem.surroundings:
+            motion = joined(
+                base_motion(self.platform, state.base[s.steps], state.torso[s.steps]),
+                gripper_motion(self.limits, state.gripper[s.steps]),
+            )
+            speed, change = motion.shares(self.problem.dt[s.steps][:-1])
+            out.append(max(speed.max(initial=0.0), change.max(initial=0.0)))
+        return np.array(out)
 
-    def missed(self, state: State) -> tuple[float, float]:
-        """How far the worst grasp is off the chosen one: metres, radians."""
+    def missed(self, state: State) -> Float[np.ndarray, "d 2"]:
+        """How far each grasp is off the chosen one: metres, radians."""
         k = self.problem.grasp_steps
         grasps, _ = self.problem.grasps(self.problem.grasp, k)
         off = edges.follow_pose(self.problem.object[k] @ grasps, state.gripper[k])[0]
-        return float(np.linalg.norm(off[:, :3], axis=1).max()), float(np.linalg.norm(off[:, 3:], axis=1).max())
+        return np.column_stack([np.linalg.norm(off[:, :3], axis=1), np.linalg.norm(off[:, 3:], axis=1)])
 
     def linearise(self, state: State, stage: Stage) -> list[Linear]:
         """All edges at a state."""
@@ -204,15 +202,16 @@ class Graph:
         near = self._near_panel
         if len(near):
             e, J = edges.panel_clearance(platform.footprint, p.panel[near], state.base[near], self.margins.panel)
-            sigma = np.full(e.shape[1], w.obstacle / stage.constraints)
-            out.append(active("moving part", near, e, [(0, BASE, J)], sigma))
+            sigma, stiff = np.full(e.shape[1], w.obstacle / stage.constraints), self.part_stiffness[near, None]
+            out.append(active("moving part", near, stiff * e, [(0, BASE, stiff[..., None] * J)], sigma))
         return out
 
     def _clearances(self, state: State, around: Surroundings, sigma: float) -> list[Linear]:
         steps = np.arange(around.steps.start, around.steps.stop)
         base = state.base[around.steps]
         e, J = edges.map_clearance(around.map, around.obstacles, self.platform.footprint, base, self.obstacle_margin)
-        out = [active("map", steps, e, [(0, BASE, J)], np.full(e.shape[1], sigma))]
+        stiff = self.map_stiffness[steps, None]
+        out = [active("map", steps, stiff * e, [(0, BASE, stiff[..., None] * J)], np.full(e.shape[1], sigma))]
         if around.unknown is not None:
             e, J = edges.base_clearance(around.unknown, np.zeros((1, 2)), np.array([self._inradius]), base, 0.0)
             out.append(active("unknown", steps, e, [(0, BASE, J)], np.array([self.weights.unknown])))

@@ -19,44 +19,55 @@ def adapt_most(
 ) -> tuple[AdaptationResult, dict[int, str]]:
     """The adaptation of the largest set that is found feasible, and why the others (by their number) were left out.
 
-    All together first. If that is refused: those that are feasible alone; then those of them that open to the same
-    side, the larger group first; then single ones. Raises InfeasibleError when none is feasible even alone.
+    All together first. If that is refused, those that are feasible alone are taken together; then fewer and fewer of
+    them: those that open to the same side, and without the one that failed at most samples. Raises InfeasibleError
+    when none is feasible even alone.
     """
     config = config or AdaptConfig()
-    everything = list(range(len(demonstrations)))
     try:
         return adapt(demonstrations, robot, config=config), {}
     except InfeasibleError as together:
-        if len(everything) == 1:
+        if len(demonstrations) == 1:
             raise
         first = together
     alone: dict[int, AdaptationResult] = {}
     left_out: dict[int, str] = {}
-    for i in everything:
+    for i, d in enumerate(demonstrations):
         try:
-            alone[i] = adapt([demonstrations[i]], robot, config=config)
+            alone[i] = adapt([d], robot, config=config)
         except InfeasibleError as e:
             left_out[i] = str(e)
     if not alone:
         raise first
-    kept = list(alone)
-    for group in _groups(demonstrations, kept, tried=kept if not left_out else []):
+    kept = tuple(alone)
+    groups = {kept, *_sides(demonstrations, kept), *((i,) for i in kept)}
+    tried: set[tuple[int, ...]] = set()
+    if not left_out:
+        tried.add(kept)
+        groups.add(_without_worst(kept, first))
+    while groups - tried:
+        group = min(groups - tried, key=lambda g: (-len(g), g))
+        tried.add(group)
         rest = {i: "cannot be adapted together with the others that were kept" for i in kept if i not in group}
         if len(group) == 1:
             return alone[group[0]], left_out | rest
         try:
             return adapt([demonstrations[i] for i in group], robot, config=config), left_out | rest
-        except InfeasibleError:
-            continue
+        except InfeasibleError as e:
+            groups.add(_without_worst(group, e))
     raise first
 
 
-def _groups(demonstrations: Sequence[Demonstration], kept: list[int], tried: list[int]) -> list[list[int]]:
-    """Sets that are worth a try, in order; the last ones are single."""
-    sides = [[i for i in kept if _side(demonstrations[i]) == side] for side in (1, -1)]
-    larger = sorted((g for g in sides if 1 < len(g) < len(kept)), key=len, reverse=True)
-    together = [kept] if kept != tried and len(kept) > 1 else []
-    return [*together, *larger, *([i] for i in kept)]
+def _without_worst(group: tuple[int, ...], error: InfeasibleError) -> tuple[int, ...]:
+    """Less the demonstration at which most samples failed (nothing less, if that is not known)."""
+    worst = max(error.failing, key=lambda i: error.failing[i], default=None)
+    return tuple(i for place, i in enumerate(group) if place != worst)
+
+
+def _sides(demonstrations: Sequence[Demonstration], kept: tuple[int, ...]) -> list[tuple[int, ...]]:
+    """Those that open to the same side."""
+    sides = [tuple(i for i in kept if _side(demonstrations[i]) == side) for side in (1, -1)]
+    return [g for g in sides if 1 < len(g) < len(kept)]
 
 
 def _side(demonstration: Demonstration) -> int:

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float
 
 from understudy import lie
 from understudy.adaptation.errors import InfeasibleError
+from understudy.adaptation.fields import half_planes
 from understudy.demonstration.demonstration import Demonstration
 from understudy.objects.articulation import PRISMATIC, REVOLUTE
 
@@ -66,6 +67,16 @@ def _seen_panel(demonstration: Demonstration, T_object: Float[np.ndarray, "t 4 4
     _, first = np.unique(np.round(rest / _PANEL_SPACING_M), axis=0, return_index=True)
     R, p = T_object[:, :2, :3], T_object[:, None, :2, 3]
     return p + part[first] @ np.swapaxes(R, 1, 2)
+
+
+def beside_part(
+    panel: Float[np.ndarray, "t m 2"], polygon: Float[np.ndarray, "k 2"], base: Float[np.ndarray, "t 3"]
+) -> Bool[np.ndarray, " t"]:
+    """Whether no point of the moving part (world, from above; NaN: none) is above the footprint, exactly."""
+    inverse = lie.se3_inverse(lie.se2_to_se3(base))
+    local = panel @ np.swapaxes(inverse[:, :2, :2], 1, 2) + inverse[:, None, :2, 3]
+    normals, offsets = half_planes(polygon)
+    return np.asarray(~((local @ normals.T - offsets).max(axis=2) < 0).any(axis=1))
 
 
 def mirrored_sides(demonstrations: Sequence[Demonstration]) -> Bool[np.ndarray, " d"]:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
@@ -11,7 +12,7 @@ from jaxtyping import Float, Int
 
 from understudy import lie
 from understudy.adaptation import edges
-from understudy.adaptation.fields import half_planes, outline
+from understudy.adaptation.fields import half_planes, outline, polygon_values
 from understudy.adaptation.graph import Problem, Surroundings
 from understudy.adaptation.platform import Platform
 
@@ -25,6 +26,7 @@ _FINE_S: Final = 0.2
 _FINE_SHARE: Final = 0.5  # of _MOVE
 _ENOUGH: Final = 80  # moments in all, for the calibration
 _WORST: Final = 400.0  # greatest cost of one constraint at one moment
+_MOST_M: Final = _SHORT_M * np.sqrt(_WORST) + edges.SOFT_M  # of a violation: beyond, it costs no more
 
 
 def _grid(x: np.ndarray, y: np.ndarray, yaw: np.ndarray) -> Float[np.ndarray, "k 3"]:
@@ -53,6 +55,8 @@ class Search:
     """height at which reach is looked up, metres"""
     margin: float = 0.04
     """metres that are kept from obstacles and from the end of reach"""
+    memory: dict[tuple[object, ...], np.ndarray] = field(default_factory=dict)
+    """costs that were computed before: neither map nor moving part ask for the torso's height"""
 
     def costs(
         self, around: Surroundings, steps: Int[np.ndarray, " m"], base: Float[np.ndarray, "m k 3"]
@@ -64,11 +68,27 @@ class Search:
 
     def blocked(self, around: Surroundings, base: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
         """What the map has against each base pose."""
-        polygon = self.platform.footprint
+        key = ("map", self.margin, around.steps.start, _digest(base))
+        if key not in self.memory:
+            self.memory[key] = self._cost_of_map(around, base)
+        return self.memory[key]
+
+    def _cost_of_map(self, around: Surroundings, base: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+        polygon, obstacles = self.platform.footprint, around.obstacles
         inner = outline(polygon * _INNER, 0.2)  # a single cell between outline and inner circle is an obstacle, too
-        points = np.vstack([outline(polygon, 0.12), inner, np.zeros((1, 2))])
-        radii = np.append(np.zeros(len(points) - 1), max(float(half_planes(polygon)[1].min()), 0.0))
-        return _cost(edges.base_clearance(around.obstacles, points, radii, base, self.margin)[0].max(axis=1))
+        points = np.vstack([outline(polygon, 0.12), inner])
+        middle = obstacles.values_at(base[:, :2])
+        room = -middle + max(float(half_planes(polygon)[1].min()), 0.0)
+        # distances change by at most the way gone: nothing is near, or the middle alone costs the most
+        far = middle > float(np.linalg.norm(points, axis=1).max()) + self.margin + edges.SOFT_M + 2 * obstacles.cell_m
+        look = np.flatnonzero(~far & (room + self.margin < _MOST_M))
+        c, s = np.cos(base[look, 2]), np.sin(base[look, 2])
+        world = np.empty((len(look), len(points), 2))
+        world[..., 0] = base[look, None, 0] + c[:, None] * points[:, 0] - s[:, None] * points[:, 1]
+        world[..., 1] = base[look, None, 1] + s[:, None] * points[:, 0] + c[:, None] * points[:, 1]
+        nearest = obstacles.values_at(world.reshape(-1, 2)).reshape(len(look), len(points)).min(axis=1, initial=np.inf)
+        room[look] = np.maximum(room[look], -nearest)
+        return _cost(np.where(far, 0.0, edges.hinge(room + self.margin, edges.SOFT_M)[0]))
 
     def reach_and_panel(
         self, steps: Int[np.ndarray, " m"], base: Float[np.ndarray, "m k 3"]
@@ -76,12 +96,29 @@ class Search:
         """What gripper and moving part have against each of k base poses at each of m steps."""
         m, k = base.shape[:2]
         flat = base.reshape(-1, 3)
-        field, rest = self.platform.reachability, np.full(m * k, self.torso)
-        gripper = np.repeat(self.gripper[steps], k, axis=0)
-        short = edges.reach(field, gripper, flat, rest, self.margin)[0][:, 0]
-        panel = np.repeat(self.problem.panel[steps], k, axis=0)
-        hit = edges.panel_clearance(self.platform.footprint, panel, flat, self.margin)[0].max(axis=1)
-        return (_cost(short) + _cost(hit)).reshape(m, k)
+        seen = lie.se3_inverse(lie.se2_to_se3(flat)).reshape(m, k, 4, 4) @ self.gripper[steps][:, None]
+        value = self.platform.reachability.value(seen.reshape(-1, 4, 4), np.full(m * k, self.torso))
+        short = edges.hinge(value + self.margin, edges.SOFT_M)[0]
+        key = ("part", self.margin, _digest(steps), _digest(flat))
+        if key not in self.memory:
+            self.memory[key] = self._cost_of_panel(steps, base)
+        return (_cost(short) + self.memory[key]).reshape(m, k)
+
+    def _cost_of_panel(self, steps: Int[np.ndarray, " m"], base: Float[np.ndarray, "m k 3"]) -> Float[np.ndarray, " n"]:
+        """Of the points of the moving part that are near enough, the one deepest in the footprint."""
+        m, k = base.shape[:2]
+        polygon, panel = self.platform.footprint, self.problem.panel[steps]
+        room = self.margin + edges.SOFT_M
+        away = panel[:, None] - base[:, :, None, :2]
+        radius = float(np.linalg.norm(polygon, axis=1).max()) + room
+        with np.errstate(invalid="ignore"):  # NaN: no point
+            pose, point = np.nonzero((np.sum(away**2, axis=3) < radius**2).reshape(m * k, -1))
+        dx, dy = away.reshape(m * k, -1, 2)[pose, point].T
+        yaw = base.reshape(-1, 3)[pose, 2]
+        c, s = np.cos(yaw), np.sin(yaw)
+        depth = np.full(m * k, -np.inf)
+        np.maximum.at(depth, pose, self.margin - polygon_values(polygon, c * dx + s * dy, c * dy - s * dx))
+        return _cost(edges.hinge(np.maximum(depth, -room), edges.SOFT_M)[0])
 
     def mean_cost(self, around: Surroundings, base: Float[np.ndarray, "t 3"]) -> float:
         """Of all steps of a path."""
@@ -97,6 +134,10 @@ class Search:
         grasp = self.problem.grasp_steps
         grasp = grasp[(grasp >= s.start) & (grasp < s.stop)]
         return np.unique(np.concatenate([np.arange(s.start, s.stop, every), [s.stop - 1], grasp]))
+
+
+def _digest(x: np.ndarray) -> bytes:
+    return hashlib.blake2b(np.ascontiguousarray(x).tobytes(), digest_size=16).digest()
 
 
 def _cost(violation: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:

@@ -16,6 +16,10 @@ from understudy.errors import UnderstudyError
 class Reachability(Protocol):
     """A smooth surrogate for 'the arm reaches this gripper pose'."""
 
+    def value(self, T_base_tool: Float[np.ndarray, "n 4 4"], torso: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+        """The value of `distance` alone."""
+        ...
+
     def distance(
         self, T_base_tool: Float[np.ndarray, "n 4 4"], torso: Float[np.ndarray, " n"]
     ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 6"], Float[np.ndarray, " n"]]:
@@ -23,6 +27,44 @@ class Reachability(Protocol):
         tool's pose (right tangent: translation, rotation, in the tool's frame); and over the torso's height (n,).
         """
         ...
+
+
+@dataclass(frozen=True, eq=False)
+class JointPath:
+    """Joints of the arm along a trajectory of t gripper poses."""
+
+    q: Float[np.ndarray, "t j"]
+    """radians; continuous joints without whole turns between samples"""
+    exact: Bool[np.ndarray, " t"]
+    """puts the gripper exactly there, within the joints' limits, clear of the robot itself"""
+    linked: Bool[np.ndarray, " t-1"]
+    """from this sample to the next by a small motion, both exact"""
+
+
+@runtime_checkable
+class JointSearch(Protocol):
+    """Finds joints for a trajectory."""
+
+    def __call__(
+        self,
+        T_base_tool: Float[np.ndarray, "t 4 4"],
+        torso: Float[np.ndarray, " t"],
+        times_s: Float[np.ndarray, " t"],
+        *,
+        thorough: bool,
+    ) -> JointPath:
+        """thorough: all solutions of all samples are looked at where few of them did not do; slow."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Arm:
+    """The arm's joints."""
+
+    velocity: Float[np.ndarray, " j"]
+    """greatest, radians/s"""
+    acceleration: Float[np.ndarray, " j"]
+    path: JointSearch
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +85,8 @@ class Platform:
     reachability: Reachability
     achievable: Callable[[Float[np.ndarray, "n 4 4"], Float[np.ndarray, " n"]], Bool[np.ndarray, " n"]]
     """exact: whether (T_base_tool, torso) has a joint configuration within limits that is clear of the robot itself"""
+    arm: Arm | None = None
+    """None: nothing is known of joints; then nothing is said of their velocities"""
 
     def __post_init__(self) -> None:
         if len(self.footprint) < 3 or _area(self.footprint) <= 0:

@@ -142,19 +142,24 @@ def holding(demonstration: Demonstration) -> Bool[np.ndarray, " t"]:
     return np.asarray((samples >= d.segments.grasp) & (samples < d.segments.release))
 
 
-def needed_speeds(problem: Problem) -> tuple[float, float]:
-    """Speed (metres/s) and turning (radians/s) that the gripper needs: the greatest while it holds the object; of the
-    way to and from it, what 95 % of the moments keep to (means over 0.15 s, so that noise does not count).
+def needed_speeds(problem: Problem) -> Float[np.ndarray, "d 2"]:
+    """Speed (metres/s) and turning (radians/s) that the gripper needs in each demonstration.
+
+    The greatest while it holds the object, which it must follow. Of the way to and from it, the speed that 95 % of
+    the moments keep to (means over 0.15 s, so that noise does not count); how a hand seems to turn on its way is
+    often wrong, and the graph may follow it less.
     """
     T = first_gripper(problem, problem.grasp)
     held = problem.holding[:-1] & problem.holding[1:] & np.isfinite(problem.dt[:-1])
-    needed = _speeds(T, problem.dt, np.flatnonzero(held), 1).max(axis=0, initial=0.0)
-    for s in problem.surroundings:
+    needed = np.zeros((len(problem.surroundings), 2))
+    for row, s in zip(needed, problem.surroundings, strict=True):
+        steps = s.steps.start + np.flatnonzero(held[s.steps.start : s.steps.stop - 1])
+        row[:] = _speeds(T, problem.dt, steps, 1).max(axis=0, initial=0.0)
         k = max(1, round(_SPEED_S / float(np.nanmedian(problem.dt[s.steps]))))
-        v = _speeds(T, problem.dt, np.arange(s.steps.start, s.steps.stop - k), k)
+        v = _speeds(T, problem.dt, np.arange(s.steps.start, s.steps.stop - k), k)[:, 0]
         if len(v):
-            needed = np.maximum(needed, np.percentile(v, 95, axis=0))
-    return float(needed[0]), float(needed[1])
+            row[0] = max(row[0], np.percentile(v, 95))
+    return needed
 
 
 def _speeds(T: np.ndarray, dt: np.ndarray, first: np.ndarray, k: int) -> Float[np.ndarray, "n 2"]:

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from understudy.adaptation.calibration import Calibration
+from understudy.adaptation.platform import JointPath
 from understudy.adaptation.solver import Convergence
 
 
@@ -30,6 +31,8 @@ class Adapted:
     """T_object_tool: that of the result, or its mirror image for a door that is hung on the other side"""
     energies: dict[str, Float[np.ndarray, " t"]]
     """cost of each kind of edge at each sample: what was bent, and why"""
+    joints: JointPath | None = None
+    """of the arm, where the robot says how they are found"""
 
 
 @dataclass(frozen=True, eq=False)

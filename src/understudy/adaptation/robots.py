@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from jaxtyping import Bool, Float
 
-from understudy.adaptation.platform import Platform, Reachability
+from understudy.adaptation.platform import Arm, JointPath, Platform, Reachability
 from understudy.robot.model import Robot
+
+if TYPE_CHECKING:
+    from understudy.robot.ik_path import IKPath
 
 
 def platform_of(robot: Robot, reachability: Reachability | None = None) -> Platform:
@@ -21,6 +26,15 @@ def platform_of(robot: Robot, reachability: Reachability | None = None) -> Platf
     def achievable(T_base_tool: Float[np.ndarray, "n 4 4"], torso: Float[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
         return solve_ik(robot, T_base_tool, torso=torso).success
 
+    def path(
+        T_base_tool: Float[np.ndarray, "t 4 4"],
+        torso: Float[np.ndarray, " t"],
+        times_s: Float[np.ndarray, " t"],
+        *,
+        thorough: bool,
+    ) -> JointPath:
+        return _joint_path(robot, T_base_tool, torso, times_s, thorough)
+
     d = robot.description
     return Platform(
         name=d.name,
@@ -32,4 +46,25 @@ def platform_of(robot: Robot, reachability: Reachability | None = None) -> Platf
         opening_m=d.gripper.opening_m,
         reachability=reachability,
         achievable=achievable,
+        arm=Arm(robot.velocity, d.limits.arm_acceleration, path),
     )
+
+
+def _joint_path(
+    robot: Robot, T: Float[np.ndarray, "t 4 4"], torso: Float[np.ndarray, " t"], times_s: np.ndarray, thorough: bool
+) -> JointPath:
+    from understudy.robot.ik_follow import follow_ik_path
+    from understudy.robot.ik_path import solve_ik_path
+
+    found = follow_ik_path(robot, T, torso, times_s)
+    if thorough and (found.jumps or not found.success.all()):
+        other = solve_ik_path(robot, T, torso, times_s)
+        if _breaks(other) < _breaks(found):
+            found = other
+    linked = found.success[1:] & found.success[:-1]
+    linked[[i - 1 for i in found.jumps]] = False
+    return JointPath(found.q, found.success, linked)
+
+
+def _breaks(path: IKPath) -> int:
+    return len(path.jumps) + int((~path.success).sum())

@@ -26,8 +26,6 @@ _REFINED: Final = 2
 _TIGHT_M: Final = 0.03  # margin of a planned path: doorways are narrow
 _OTHER_M: Final = 5.0  # of a grasp from those that the hands show (a radian is 0.3 m) that costs 1
 
-
-DEBUG = True
 Grasp = tuple[grasps.GraspFamily, Float[np.ndarray, "4 4"]]
 
 

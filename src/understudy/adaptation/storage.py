@@ -6,6 +6,7 @@ import io
 import json
 import zipfile
 from collections.abc import Mapping
+from dataclasses import fields
 from pathlib import Path
 from typing import Any, Final
 
@@ -14,6 +15,7 @@ from jaxtyping import Float
 
 from understudy.adaptation.calibration import Calibration
 from understudy.adaptation.metrics import Metrics, as_numbers
+from understudy.adaptation.platform import JointPath
 from understudy.adaptation.result import AdaptationResult, Adapted, Report
 from understudy.adaptation.solver import Convergence, Iteration
 from understudy.errors import RecordingError
@@ -24,6 +26,7 @@ FILE: Final = "adaptation.json"
 FORMAT: Final = 2
 _ARRAYS: Final = ("times_s", "T_world_tool", "base", "torso", "achievable", "collision_free", "grasp")
 _ENERGY: Final = "energy:"
+_JOINTS: Final = "joints:"
 
 
 def save(folder: Path, result: AdaptationResult, metrics: Mapping[str, Metrics] | None = None) -> None:
@@ -33,6 +36,8 @@ def save(folder: Path, result: AdaptationResult, metrics: Mapping[str, Metrics] 
         buffer = io.BytesIO()
         arrays: dict[str, Any] = {name: getattr(d, name) for name in _ARRAYS}
         arrays |= {_ENERGY + kind: values for kind, values in d.energies.items()}
+        if d.joints is not None:
+            arrays |= {_JOINTS + f.name: getattr(d.joints, f.name) for f in fields(JointPath)}
         np.savez_compressed(buffer, **arrays)
         write_atomically(folder / f"{i:03d}.npz", buffer.getvalue())
     convergence = result.report.convergence
@@ -113,8 +118,14 @@ def _demonstration(path: Path) -> Adapted:
         raise RecordingError(f"{path}: no array {missing[0]!r}")
     t = arrays["times_s"].shape[0] if arrays["times_s"].ndim else 0
     shapes = {"times_s": (t,), "T_world_tool": (t, 4, 4), "base": (t, 3), "grasp": (4, 4)}
+    shapes |= {
+        _JOINTS + "q": (t, *arrays.get(_JOINTS + "q", np.zeros((t, 0))).shape[1:2]),
+        _JOINTS + "linked": (t - 1,),
+    }
     for name in arrays:
         if arrays[name].shape != shapes.get(name, (t,)):
             raise RecordingError(f"{path}: {name}: must have shape {shapes.get(name, (t,))}, got {arrays[name].shape}")
     energies = {name.removeprefix(_ENERGY): a for name, a in arrays.items() if name.startswith(_ENERGY)}
-    return Adapted(**{name: arrays[name] for name in _ARRAYS}, energies=energies)
+    found = {f.name: arrays[_JOINTS + f.name] for f in fields(JointPath) if _JOINTS + f.name in arrays}
+    joints = JointPath(**found) if len(found) == len(fields(JointPath)) else None
+    return Adapted(**{name: arrays[name] for name in _ARRAYS}, energies=energies, joints=joints)

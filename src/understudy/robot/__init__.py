@@ -21,6 +21,7 @@ from understudy.robot.description import (
 if TYPE_CHECKING:
     from understudy.robot.ik import IKResult as IKResult
     from understudy.robot.ik import solve_ik as solve_ik
+    from understudy.robot.ik_follow import follow_ik_path as follow_ik_path
     from understudy.robot.ik_path import IKPath as IKPath
     from understudy.robot.ik_path import solve_ik_path as solve_ik_path
     from understudy.robot.model import Robot as Robot
@@ -37,6 +38,7 @@ _LATE = {
     "urdf_with_base": "urdf",
     "IKResult": "ik",
     "solve_ik": "ik",
+    "follow_ik_path": "ik_follow",
     "IKPath": "ik_path",
     "solve_ik_path": "ik_path",
     "ReachabilityField": "reachability",
@@ -57,6 +59,7 @@ __all__ = [
     "Robot",
     "RobotDescription",
     "RobotError",
+    "follow_ik_path",
     "load_description",
     "load_field",
     "load_map",

@@ -17,13 +17,11 @@ from understudy.robot.ik_kernels import follow_branches
 from understudy.robot.ik_path import IKPath, velocity_share
 from understudy.robot.model import Robot
 
-_STARTS: Final = 3
-"""samples whose solutions are followed: the ends and the middle"""
+_STARTS: Final = 5
+"""samples whose solutions are followed, both ends among them"""
 _SEEDS, _SOLUTIONS = 48, 8  # at each of them
 _JUMP: Final = 0.5
 """radians of one joint between samples: the branch is not followed there, but changed"""
-_TRIED: Final = 6
-"""branches that are checked for self-collision"""
 
 
 def follow_ik_path(
@@ -48,14 +46,18 @@ def follow_ik_path(
     share = np.array([_greatest(robot, path, good, times_s) for path, good in zip(paths, ok, strict=True)])
     order = np.lexsort((share, -ok.sum(axis=1)))
     best, least = None, t + 1
-    for b in order[:_TRIED]:
+    colliding = np.zeros(t, bool)  # at these samples others collided: checked first, most branches go no farther
+    for b in order:
         good = ok[b].copy()
-        if (t - good.sum()) >= least:
-            break
-        if check_collisions:
-            good[good] = ~robot.collides(paths[b, good, 1:], paths[b, good, 0])
+        for part in (good & colliding, good & ~colliding) if check_collisions else ():
+            rows = np.flatnonzero(part)
+            if t - good.sum() < least and len(rows):
+                good[rows] = ~robot.collides(paths[b, rows, 1:], paths[b, rows, 0])
+        colliding |= ok[b] & ~good
         if t - good.sum() < least:
             best, least = (paths[b], good), t - int(good.sum())
+        if not least:
+            break
     assert best is not None
     return _path(problem, *best, times_s)
 
