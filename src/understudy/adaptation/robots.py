@@ -53,12 +53,15 @@ def platform_of(robot: Robot, reachability: Reachability | None = None) -> Platf
 def _joint_path(
     robot: Robot, T: Float[np.ndarray, "t 4 4"], torso: Float[np.ndarray, " t"], times_s: np.ndarray, thorough: bool
 ) -> JointPath:
+    from understudy.robot.ik_bridge import bridged
     from understudy.robot.ik_follow import follow_ik_path
     from understudy.robot.ik_path import solve_ik_path
 
     found = follow_ik_path(robot, T, torso, times_s)
-    if thorough and (found.jumps or not found.success.all()):
-        other = solve_ik_path(robot, T, torso, times_s)
+    if thorough and found.jumps:
+        found = bridged(robot, found, T)
+    if thorough and _breaks(found):
+        other = bridged(robot, solve_ik_path(robot, T, torso, times_s), T)
         if _breaks(other) < _breaks(found):
             found = other
     linked = found.success[1:] & found.success[:-1]
