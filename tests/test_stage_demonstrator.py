@@ -20,6 +20,7 @@ pytest.importorskip("anny", reason="bodies need anny")
 
 from understudy.stage.body import SOLE, draw_body
 from understudy.stage.demonstrator import Performance, perform, performance_of
+from understudy.stage.markers import hand_markers, torso_markers
 from understudy.stage.motion import plan_motion
 from understudy.stage.motion_profiles import Clock, draw_clock, ease
 from understudy.stage.motion_space import Space
@@ -167,18 +168,24 @@ def test_surfaces_face_outward() -> None:
             assert np.sum((a - v.mean(0)) * normal) > 0, piece.name
 
 
-def test_markers_are_rigid_and_outside() -> None:
+def test_markers_are_outside_and_look_away() -> None:
+    """No plate is in the body (but for long hair), each looks away from it, and the hand's are near the hand."""
     p = seen()
-    T = np.linalg.inv(p.T_world_hand[p.acting]) @ p.hand_markers[p.acting]
-    assert np.abs(T - T[0]).max() < 1e-9 and T[0, 2, 2] == pytest.approx(-1)
+    markers = [*hand_markers(p.acting), *torso_markers()]
     for i in (0, p.segments.grasp, p.segments.release, len(p) - 1):
-        for name, T_world_marker in p.marker_poses(i).items():
-            local = transform_points(inverse(T_world_marker), np.concatenate(p.vertices(i)).astype(np.float64))
-            half = 0.04 if name == "hand" else 0.07
-            before = (np.abs(local[:, :2]) < half).all(1) & (local[:, 2] > 0) & (local[:, 2] < 0.12)
-            assert not before.any(), (name, i)
-            assert np.abs(local[(np.abs(local[:, :2]) < half).all(1), 2]).min() < 0.13
-    assert (p.torso_marker[0, :2, 2] @ (np.cos(p.torso_xy_yaw[0, 2]), np.sin(p.torso_xy_yaw[0, 2]))) < -0.8
+        body = np.concatenate(p.vertices(i)).astype(np.float64)
+        for marker in markers:
+            T_marker_frame = marker.T_marker_frame
+            middle = np.mean([inverse(m.T_marker_frame)[:3, 3] for m in markers if m.on == marker.on], axis=0)
+            assert transform_points(T_marker_frame, middle[None])[0, 2] < 1e-9
+            local = transform_points(T_marker_frame @ inverse(p.carriers(i)[marker.on]), body)
+            half = marker.size_m / 2
+            through = (np.abs(local[:, :2]) < half).all(axis=1) & (np.abs(local[:, 2]) < 0.01)
+            assert not through.any(), (marker.id, i)
+            assert np.linalg.norm(local, axis=1).min() < 0.2
+    rear = inverse(torso_markers()[0].T_marker_frame)[:3, 2]
+    heading = p.torso_xy_yaw[0, 2]
+    assert (p.carriers(0)["torso"][:3, :3] @ rear)[:2] @ (np.cos(heading), np.sin(heading)) < -0.8
 
 
 def test_limbs_reach_or_point_there() -> None:

@@ -71,6 +71,11 @@ class DemonstrationConfig:
                 "poses from markers need a file that says which marker is on what: markers (--markers)"
             )
 
+    @property
+    def all_markers(self) -> bool:
+        """Whether nothing is taken from the depth and colour of hands and object."""
+        return self.object == self.teacher == MARKERS
+
 
 def build(
     recording: Recording, people: Sequence[FramePeople], config: DemonstrationConfig | None = None

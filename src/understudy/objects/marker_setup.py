@@ -29,6 +29,7 @@ CARRIERS: Final = ("object", "hand", "torso")
 """What a marker can be on."""
 
 _AGREE: Final = float(chi2.ppf(0.9999, 6))  # markers on one thing whose poses differ by more are not fused
+_ARM_M: Final = 0.1  # at which a turn counts like a shift, where poses are compared
 _ORIENTED_RAD: Final = float(np.radians(15))  # largest standard deviation of a rotation that counts as measured
 
 
@@ -118,10 +119,11 @@ def track_markers(
     """Tracks of everything in the setup that carries a marker, a sample per frame.
 
     Where no marker of a thing is seen its pose is NaN and its covariance infinite; nothing is filled in. Several
-    markers on one thing are fused; one that contradicts the surest is left out.
+    markers on one thing are fused; those that contradict what most of them say are left out.
     """
-    tracker = MarkerTracker({m.id: m.size_m for m in setup.markers}, setup.dictionary)
     carriers = [on for on in CARRIERS if any(m.on == on for m in setup.markers)]
+    groups = [[m.id for m in setup.markers if m.on == on] for on in carriers]
+    tracker = MarkerTracker({m.id: m.size_m for m in setup.markers}, setup.dictionary, groups=groups)
     rows: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {on: [] for on in carriers}
     unknown = (np.full((4, 4), np.nan), np.diag(np.full(6, np.inf)))
     for frame in frames:
@@ -152,19 +154,36 @@ def _carried(pose: MarkerPose, marker: Marker, T_world_cam: np.ndarray) -> tuple
 
 
 def _fused(poses: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
-    """Mean of poses, weighted by their information, in the tangent space of the surest."""
-    T, first = min(poses, key=lambda pose: float(np.trace(pose[1][:3, :3]) + 0.01 * np.trace(pose[1][3:, 3:])))
+    """Mean of poses, weighted by their information, in the tangent space of one of them.
+
+    That one is the pose that most others agree with, of several such ones the surest; those that contradict it are
+    left out.
+    """
+    doubt = [float(np.trace(C[:3, :3]) + _ARM_M**2 * np.trace(C[3:, 3:])) for _, C in poses]
+    apart = np.array([[_apart(a, b) for b in poses] for a in poses]).reshape(len(poses), len(poses), 6)
+    agree = np.array(
+        [[_distance(apart[i, j], a[1] + b[1]) < _AGREE for j, b in enumerate(poses)] for i, a in enumerate(poses)]
+    )
+    middle = min(range(len(poses)), key=lambda i: (-agree[i].sum(), doubt[i]))
     information, pull = np.zeros((6, 6)), np.zeros(6)
-    for other, covariance in poses:
-        turn = Rotation.from_matrix(other[:3, :3] @ T[:3, :3].T).as_rotvec()
-        e = np.concatenate([other[:3, 3] - T[:3, 3], turn])
-        if e @ np.linalg.solve(first + covariance, e) < _AGREE:
-            W = np.linalg.inv(covariance)
-            information += W
-            pull += W @ e
+    for j in np.flatnonzero(agree[middle]):
+        W = np.linalg.inv(poses[j][1])
+        information += W
+        pull += W @ apart[middle, j]
     covariance = np.linalg.inv(information)
     step = covariance @ pull
-    fused = T.copy()
+    fused = poses[middle][0].copy()
     fused[:3, 3] += step[:3]
-    fused[:3, :3] = Rotation.from_rotvec(step[3:]).as_matrix() @ T[:3, :3]
+    fused[:3, :3] = Rotation.from_rotvec(step[3:]).as_matrix() @ fused[:3, :3]
     return fused, covariance
+
+
+def _apart(a: tuple[np.ndarray, np.ndarray], b: tuple[np.ndarray, np.ndarray]) -> Float[np.ndarray, "6"]:
+    """(dp, dr) from the first pose to the second."""
+    turn = Rotation.from_matrix(b[0][:3, :3] @ a[0][:3, :3].T).as_rotvec()
+    return np.concatenate([b[0][:3, 3] - a[0][:3, 3], turn])
+
+
+def _distance(e: Float[np.ndarray, "6"], covariance: Float[np.ndarray, "6 6"]) -> float:
+    """Squared, in standard deviations."""
+    return float(e @ np.linalg.solve(covariance, e))

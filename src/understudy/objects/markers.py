@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Final
 
@@ -12,7 +12,8 @@ from jaxtyping import Float, UInt8
 from scipy.spatial.transform import Rotation
 
 from understudy.errors import UnderstudyError, one_of
-from understudy.objects.marker_pose import Solution, aligned_corners, depth_plane, solve_square
+from understudy.objects.marker_corners import fit_corners
+from understudy.objects.marker_pose import Solution, depth_plane, solve_square
 from understudy.types import RegisteredFrame
 
 DICTIONARIES: Final = {
@@ -22,7 +23,7 @@ DICTIONARIES: Final = {
 }
 """Names of families of markers, such as 'apriltag_36h11' and '4x4_50', and OpenCV's numbers for them."""
 
-_ENLARGED: Final = 2.0  # images in which a marker is missing are looked at again, so much larger ...
+_ENLARGED: Final = 2.0  # images in which a thing's markers are missing are looked at again, so much larger ...
 _ENLARGED_EVERY: Final = 5  # ... one frame in so many: it takes five times as long as the rest together
 _NEAR: Final = 2.5  # of a tag's size: where it is looked for first, around where it was
 _NEAR_ENLARGED: Final = 3.0  # at most
@@ -32,6 +33,9 @@ _REMEMBERED: Final = 10  # frames
 _TURN: Final = 0.35  # radians: between frames, a turn of this size costs as much as one standard deviation
 _SAME_RAD: Final = 0.01
 _LARGEST_DOUBT: Final = 9.0  # that continuity can cast on a pose, squared standard deviations
+
+Region = tuple[int, int, int, int]
+"""Of an image: its left, top, right and bottom, pixels; those two not in it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,11 +57,17 @@ class MarkerTracker:
     """Finds markers in frames, one after the other.
 
     size_m: edge of the black square, of all markers or by id; with a mapping, other ids are left alone.
-    dictionary: one of DICTIONARIES. depth: whether poses use it.
+    dictionary: one of DICTIONARIES. depth: whether poses use it. groups: ids that are on the same thing: while one of
+    them is followed, the others are looked for around it only. Without groups each marker is a thing of its own.
     """
 
     def __init__(
-        self, size_m: Mapping[int, float] | float, dictionary: str = "apriltag_36h11", *, depth: bool = True
+        self,
+        size_m: Mapping[int, float] | float,
+        dictionary: str = "apriltag_36h11",
+        *,
+        depth: bool = True,
+        groups: Collection[Collection[int]] | None = None,
     ) -> None:
         if dictionary not in DICTIONARIES:
             raise UnderstudyError(f"markers: dictionary {dictionary!r} is not {one_of(DICTIONARIES)}")
@@ -70,6 +80,8 @@ class MarkerTracker:
         if outside:
             raise UnderstudyError(f"markers: dictionary {dictionary!r} has ids 0 to {count - 1}, not {outside}")
         self._size, self._depth = size_m, depth
+        ids = list(size_m) if isinstance(size_m, Mapping) else []
+        self._groups = [frozenset(group) for group in groups] if groups is not None else [frozenset([i]) for i in ids]
         parameters = cv2.aruco.DetectorParameters()
         parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
         self._detector = cv2.aruco.ArucoDetector(self._dictionary, parameters)
@@ -98,36 +110,28 @@ class MarkerTracker:
 
     def _found(self, gray: UInt8[np.ndarray, "h w"]) -> dict[int, np.ndarray]:
         """Corners (pixels) by id: first around where they were, then in the whole image, then by looking closer."""
-        recent = [id for id, (_, when) in self._last.items() if self._frame - when <= _REMEMBERED]
+        recent = {id: pose for id, (pose, when) in self._last.items() if self._frame - when <= _REMEMBERED}
         seen: dict[int, list[np.ndarray]] = {}
-        for id in recent:
-            seen |= self._near(gray, id, _NEAR_PX)
-        if not self._complete(seen) or not isinstance(self._size, Mapping):
-            seen |= self._search(gray, (0, 0), 1.0)
-        for id in recent:
-            if id not in seen:
-                seen |= self._near(gray, id, np.inf)
+        for region in _joined([_around(pose.corners_2d, gray.shape) for pose in recent.values()]):
+            seen |= self._near(gray, region, [p for p in recent.values() if _holds(region, p.corners_2d.mean(0))])
+        if not self._complete(seen) or self._frame % _ENLARGED_EVERY == 0:
+            seen = self._search(gray, (0, 0), 1.0) | seen
         if not self._complete(seen) and self._frame % _ENLARGED_EVERY == 1:
             seen = self._search(gray, (0, 0), _ENLARGED) | seen
         return {id: corners[0] for id, corners in seen.items() if len(corners) == 1}
 
-    def _complete(self, seen: Mapping[int, list[np.ndarray]]) -> bool:
-        """Whether no more markers are expected."""
-        return len(seen) >= (len(self._size) if isinstance(self._size, Mapping) else 1)
+    def _complete(self, seen: Collection[int]) -> bool:
+        """Whether of every thing a marker is seen; never, where nobody said what there is."""
+        return bool(self._groups) and all(not group.isdisjoint(seen) for group in self._groups)
 
-    def _near(self, gray: UInt8[np.ndarray, "h w"], id: int, pixels: float) -> dict[int, list[np.ndarray]]:
-        """A marker around where it was last, enlarged to so many pixels if it was smaller."""
-        corners = self._last[id][0].corners_2d
-        middle, side = corners.mean(axis=0), float(np.ptp(corners, axis=0).max())
-        reach = max(_NEAR * side, _LEAST_NEAR_PX)
-        low = np.clip((middle - reach).astype(int), 0, gray.shape[::-1])
-        high = np.clip((middle + reach).astype(int), 0, gray.shape[::-1])
-        if (high - low <= 8).any():
+    def _near(self, gray: UInt8[np.ndarray, "h w"], region: Region, poses: list[MarkerPose]) -> dict[int, list]:
+        """What is in a part of the image, which is enlarged for the smallest marker that was there."""
+        u, v, right, low = region
+        if right - u <= 8 or low - v <= 8:
             return {}
-        part = gray[low[1] : high[1], low[0] : high[0]]
-        scale = float(np.clip(pixels / max(side, 1.0), 1.0, _NEAR_ENLARGED))
-        closer = self._search(part, (int(low[0]), int(low[1])), scale)
-        return {k: v for k, v in closer.items() if k == id}
+        smallest = min(float(np.ptp(pose.corners_2d, axis=0).max()) for pose in poses)
+        scale = float(np.clip(_NEAR_PX / max(smallest, 1.0), 1.0, _NEAR_ENLARGED))
+        return self._search(gray[v:low, u:right], (u, v), scale)
 
     def _search(
         self, gray: UInt8[np.ndarray, "h w"], origin: tuple[int, int], scale: float
@@ -153,10 +157,11 @@ class MarkerTracker:
         return self._patterns[id]
 
     def _pose(self, frame: RegisteredFrame, gray: np.ndarray, id: int, corners: np.ndarray) -> MarkerPose | None:
-        corners, sigma_px = aligned_corners(gray, corners, self._pattern(id))
+        fitted = fit_corners(gray, corners, self._pattern(id))
+        corners = fitted.uv
         plane = depth_plane(frame.depth, corners, frame.depth.scale_to(frame.camera)) if self._depth else None
         size = self._size[id] if isinstance(self._size, Mapping) else self._size
-        solutions = solve_square(frame.camera, corners, sigma_px, size, plane)
+        solutions = solve_square(frame.camera, corners, fitted.covariance, size, plane)
         if not solutions:
             return None
         costs = np.array([s.cost + self._doubt(id, s) for s in solutions])
@@ -175,6 +180,33 @@ class MarkerTracker:
         turn = solution.T_cam_marker[:3, :3] @ last[0].T_cam_marker[:3, :3].T
         angle = float(Rotation.from_matrix(turn).magnitude())
         return min(angle**2 / (_TURN**2 * (self._frame - last[1])), _LARGEST_DOUBT) / 2
+
+
+def _around(corners: Float[np.ndarray, "4 2"], shape: tuple[int, ...]) -> Region:
+    """Where a marker is looked for that was there."""
+    reach = max(_NEAR * float(np.ptp(corners, axis=0).max()), _LEAST_NEAR_PX)
+    low = np.clip((corners.mean(axis=0) - reach).astype(int), 0, shape[1::-1])
+    high = np.clip((corners.mean(axis=0) + reach).astype(int), 0, shape[1::-1])
+    return int(low[0]), int(low[1]), int(high[0]), int(high[1])
+
+
+def _joined(regions: list[Region]) -> list[Region]:
+    """The regions, those that overlap made into one."""
+    joined: list[Region] = []
+    for region in regions:
+        apart = []
+        for other in joined:
+            if region[0] < other[2] and other[0] < region[2] and region[1] < other[3] and other[1] < region[3]:
+                low, high = np.minimum(region, other)[:2], np.maximum(region, other)[2:]
+                region = int(low[0]), int(low[1]), int(high[0]), int(high[1])
+            else:
+                apart.append(other)
+        joined = [*apart, region]
+    return joined
+
+
+def _holds(region: Region, point: Float[np.ndarray, "2"]) -> bool:
+    return bool(region[0] <= point[0] <= region[2] and region[1] <= point[1] <= region[3])
 
 
 def _same(a: Solution, b: Solution) -> bool:

@@ -5,14 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Final
 
 import numpy as np
 from jaxtyping import Float, Float32
 
 from understudy.demonstration.demonstration import Segments
 from understudy.errors import UnderstudyError
-from understudy.geometry import rigid
 from understudy.skeleton import JOINT
 from understudy.stage.appearance import draw_looks, dress
 from understudy.stage.appearance_pieces import Garment, Piece
@@ -22,16 +20,7 @@ from understudy.stage.kinematics import unit
 from understudy.stage.kinematics_body import SPINE
 from understudy.stage.motion import Motion, plan_motion
 
-__all__ = ["HAND_MARKER_M", "TORSO_MARKER_M", "Performance", "Piece", "T_HAND_MARKER", "T_TORSO_MARKER", "perform"]
-
-HAND_MARKER_M: Final = 0.14
-"""Side of the plate on the back of the acting hand, metres."""
-TORSO_MARKER_M: Final = 0.18
-"""Side of the plate on the back, metres."""
-T_HAND_MARKER: Final = rigid(np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]]), np.array([0.005, 0.0, -0.045]))
-"""T_hand_marker. Marker frame: origin in its middle, x right and y up on the print, z out of the printed face."""
-T_TORSO_MARKER: Final = rigid(np.array([[0.0, 0, -1], [-1, 0, 0], [0, 1, 0]]), np.array([-0.19, 0.0, 0.10]))
-"""T_torso_marker. Torso frame: origin midway between shoulders and hips, z from hips to shoulders, x forward."""
+__all__ = ["Performance", "Piece", "perform"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +42,7 @@ class Performance:
     torso_xy_yaw: Float[np.ndarray, "t 3"]
     """point of the floor below the middle of shoulders and hips; yaw of the chest, unwrapped"""
     T_world_torso: Float[np.ndarray, "t 4 4"]
-    """origin midway between the middles of shoulders and hips, z from hips to shoulders, y near the shoulders' left"""
+    """origin midway between the middles of shoulders and hips, z from hips to shoulders, x with the chest's heading"""
     T_handle_hand: Float[np.ndarray, "4 4"]
     """how the acting hand holds the handle"""
     R_world_bone: Float[np.ndarray, "t b 3 3"]
@@ -78,19 +67,9 @@ class Performance:
             out.append(points.astype(np.float32))
         return out
 
-    @property
-    def hand_markers(self) -> dict[str, Float[np.ndarray, "t 4 4"]]:
-        """Side -> T_world_marker of the plate on that hand's back; rigid to the hand."""
-        return {side: T @ T_HAND_MARKER for side, T in self.T_world_hand.items()}
-
-    @property
-    def torso_marker(self) -> Float[np.ndarray, "t 4 4"]:
-        """T_world_marker of the plate on the back; rigid to `T_world_torso`."""
-        return np.asarray(self.T_world_torso @ T_TORSO_MARKER)
-
-    def marker_poses(self, i: int) -> dict[str, Float[np.ndarray, "4 4"]]:
-        """T_world_marker of the plates on the acting hand and on the back, at sample i."""
-        return {"hand": self.hand_markers[self.acting][i], "torso": self.torso_marker[i]}
+    def carriers(self, i: int) -> dict[str, Float[np.ndarray, "4 4"]]:
+        """Poses in the world, at sample i, of what markers are put on: the acting hand and the torso."""
+        return {"hand": self.T_world_hand[self.acting][i], "torso": self.T_world_torso[i]}
 
 
 @lru_cache(maxsize=4)
@@ -119,8 +98,9 @@ def performance_of(motion: Motion, fps: float, garments: tuple[Garment, ...] = (
     times = np.arange(int(clock.end * fps) + 1) / fps
     R, p = motion.at(times)
     joints = skeleton.joints(R, p)
-    T_torso = _torso(joints)
     chest = R[:, skeleton.bone(SPINE[-1]), :, 0]
+    yaw = np.unwrap(np.arctan2(chest[:, 1], chest[:, 0]))
+    T_torso = _torso(joints, yaw)
     grasp, release = (int(np.searchsorted(times, moment - 1e-9)) for moment in (clock.grasp, clock.release))
     return Performance(
         times,
@@ -130,7 +110,7 @@ def performance_of(motion: Motion, fps: float, garments: tuple[Garment, ...] = (
         tuple(g.piece for g in garments),
         joints,
         {side: skeleton.hand(R, p, side) for side in SIDES},
-        np.column_stack([T_torso[:, :2, 3], np.unwrap(np.arctan2(chest[:, 1], chest[:, 0]))]),
+        np.column_stack([T_torso[:, :2, 3], yaw]),
         T_torso,
         motion.grip.T_handle_hand,
         R,
@@ -140,13 +120,16 @@ def performance_of(motion: Motion, fps: float, garments: tuple[Garment, ...] = (
     )
 
 
-def _torso(joints: Float[np.ndarray, "t 18 3"]) -> Float[np.ndarray, "t 4 4"]:
-    """Frame of the torso: from the midpoint of the hips to that of the shoulders is z, shoulders' left is near y."""
-    left, right = joints[:, JOINT["left_shoulder"]], joints[:, JOINT["right_shoulder"]]
+def _torso(joints: Float[np.ndarray, "t 18 3"], yaw: Float[np.ndarray, " t"]) -> Float[np.ndarray, "t 4 4"]:
+    """Frame of the torso: from the midpoint of the hips to that of the shoulders is z; x has the chest's heading, which
+    that of the shoulders' line is not while an arm reaches.
+    """
+    shoulders = (joints[:, JOINT["left_shoulder"]] + joints[:, JOINT["right_shoulder"]]) / 2
     hips = (joints[:, JOINT["left_hip"]] + joints[:, JOINT["right_hip"]]) / 2
-    z = unit((left + right) / 2 - hips)
-    x = unit(np.cross(left - right, z))
+    z = unit(shoulders - hips)
+    level = np.column_stack([np.cos(yaw), np.sin(yaw)])
+    x = unit(np.column_stack([level, -np.sum(level * z[:, :2], axis=1) / z[:, 2]]))
     T = np.tile(np.eye(4), (len(joints), 1, 1))
     T[:, :3, :3] = np.stack([x, np.cross(z, x), z], -1)
-    T[:, :3, 3] = (hips + (left + right) / 2) / 2
+    T[:, :3, 3] = (hips + shoulders) / 2
     return T

@@ -16,6 +16,7 @@ WOODS = ((0.72, 0.53, 0.35), (0.55, 0.38, 0.24), (0.83, 0.70, 0.53), (0.42, 0.28
 PAINTS = ((0.90, 0.89, 0.86), (0.80, 0.80, 0.78), (0.62, 0.66, 0.66), (0.55, 0.60, 0.52), (0.86, 0.80, 0.68))
 WALLS = ((0.88, 0.86, 0.82), (0.82, 0.84, 0.84), (0.85, 0.80, 0.70), (0.76, 0.80, 0.76), (0.80, 0.74, 0.70))
 THINGS = ((0.65, 0.20, 0.18), (0.20, 0.35, 0.55), (0.25, 0.42, 0.28), (0.75, 0.55, 0.20), (0.3, 0.3, 0.33))
+_PLATE_M = 0.002  # thickness
 
 
 @dataclass
@@ -84,15 +85,15 @@ def furniture_materials(palette: Palette) -> dict[str, str]:
 def add_plate(
     palette: Palette, body: mujoco.MjsBody, name: str, image: Image, side: float, T: Float[np.ndarray, "4 4"]
 ) -> None:
-    """A thin square plate with a picture on its +z side; T: its pose on the body."""
+    """A thin square plate with a picture on its +z side; T: the picture's pose on the body."""
     material = palette.add(name, image, cube=False, shine=0.0)
     body.add_geom(
         name=name,
         type=mujoco.mjtGeom.mjGEOM_BOX,
         material=material,
-        pos=T[:3, 3],
+        pos=T[:3, 3] - _PLATE_M / 2 * T[:3, 2],
         quat=Rotation.from_matrix(T[:3, :3]).as_quat(scalar_first=True),
-        size=[side / 2, side / 2, 0.001],
+        size=[side / 2, side / 2, _PLATE_M / 2],
         contype=0,
         conaffinity=0,
         mass=0.01,

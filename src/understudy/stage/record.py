@@ -19,13 +19,13 @@ from understudy.demonstration.tasks import TASKS
 from understudy.errors import UnderstudyError, one_of
 from understudy.files import write_atomically
 from understudy.geometry import inverse, transform_points
-from understudy.objects.marker_setup import Marker, MarkerSetup
+from understudy.objects.marker_setup import MarkerSetup
 from understudy.recordings.folder import INFO
 from understudy.recordings.truth import Truth, TruthPerson
 from understudy.recordings.writer import FolderWriter
-from understudy.stage.demonstrator import HAND_MARKER_M, T_HAND_MARKER, T_TORSO_MARKER, TORSO_MARKER_M, perform
+from understudy.stage.demonstrator import perform
 from understudy.stage.furniture import Furniture, sample_furniture
-from understudy.stage.markers import DICTIONARY, PLATE, object_marker
+from understudy.stage.markers import marker_setup
 from understudy.stage.render import Renderer, Surfaces
 from understudy.stage.scene import Piece, Scene
 from understudy.stage.sensor import Sensor
@@ -60,7 +60,7 @@ class Performance(Protocol):
     def acting(self) -> str: ...
     @property
     def segments(self) -> Segments: ...
-    def marker_poses(self, i: int) -> Mapping[str, Float[np.ndarray, "4 4"]]: ...
+    def carriers(self, i: int) -> Mapping[str, Float[np.ndarray, "4 4"]]: ...
 
 
 def record(
@@ -127,7 +127,7 @@ def record_performance(
     """Records one performance; `settings` are noted in its truth. Returns the folder."""
     folder = Path(folder)
     eye = Sensor(sensor, seed, fine_color=markers)
-    plates = _markers(furniture) if markers else None
+    plates = marker_setup(furniture, performance.acting) if markers else None
     scene = Scene(
         furniture, seed, performance.pieces, performance.vertices(0), () if plates is None else plates.markers
     )
@@ -145,7 +145,7 @@ def record_performance(
     small = eye.camera.color.scale(0.5)  # is enough to tell what hides a joint
     with Renderer(scene) as renderer:
         for i in tqdm(range(len(times)), desc=folder.name, unit="frame", disable=not progress):
-            scene.pose(float(performance.q[i]), performance.vertices(i), _carried(performance, i) if markers else {})
+            scene.pose(float(performance.q[i]), performance.vertices(i), performance.carriers(i) if markers else {})
             renderer.update()
             color = eye.photo(renderer.color(eye.camera.color, T_world_cam), i)
             depth = eye.measure(renderer.surfaces(eye.camera.depth, eye.depth_pose(T_world_cam)), i)
@@ -193,24 +193,6 @@ def _stage_truth(
         performance.segments,
         plates,
     )
-
-
-def _markers(furniture: Furniture) -> MarkerSetup:
-    """On the furniture, the back of the acting hand, and the person's back."""
-    return MarkerSetup(
-        DICTIONARY,
-        (
-            object_marker(furniture),
-            Marker(1, HAND_MARKER_M / PLATE, "hand", inverse(T_HAND_MARKER)),
-            Marker(2, TORSO_MARKER_M / PLATE, "torso", inverse(T_TORSO_MARKER)),
-        ),
-    )
-
-
-def _carried(performance: Performance, i: int) -> dict[str, Float[np.ndarray, "4 4"]]:
-    """Carrier -> T_world_marker at sample i, of the markers that the person carries."""
-    poses = performance.marker_poses(i)
-    return {"hand": poses["hand"], "torso": poses["torso"]}
 
 
 def _person(

@@ -14,7 +14,7 @@ from understudy.demonstration.tasks import TASKS
 from understudy.geometry import inverse
 from understudy.objects.marker_setup import Marker
 from understudy.stage.furniture import Furniture
-from understudy.stage.markers import OBJECT, PLATE, plate_image
+from understudy.stage.markers import OBJECT, PLATE, mount, plate_image
 from understudy.stage.mechanism import PART, add_furniture
 from understudy.stage.palette import Palette, add_plate, furniture_materials
 from understudy.stage.room import add_room
@@ -62,8 +62,7 @@ class Scene:
         add_room(palette, furniture, materials)
         for piece, points in zip(self.pieces, vertices, strict=True):
             _add_skin(palette, piece, points)
-        for marker in markers:
-            _add_marker(palette, marker)
+        _add_markers(palette, markers, materials)
         # the region of shadows: beyond its rim a shadow map gives a moire pattern
         spec.stat.extent, spec.stat.center, spec.visual.map.shadowclip = 3.0, [-0.8, 0, 1.0], 2.0
         self.model = spec.compile()
@@ -80,7 +79,7 @@ class Scene:
     ) -> None:
         """Moves the part to q, the person's surface to vertices (world, one array per piece), and the markers.
 
-        carried: carrier -> T_world_marker of the marker that it carries.
+        carried: thing that carries markers (but for the part) -> its pose in the world.
         """
         model, data = self.model, self.data
         data.qpos[self._joint] = q
@@ -121,11 +120,24 @@ def _add_skin(palette: Palette, piece: Piece, points: Float32[np.ndarray, "v 3"]
     )
 
 
-def _add_marker(palette: Palette, marker: Marker) -> None:
-    image, side = plate_image(marker.id), marker.size_m * PLATE
-    if marker.on == OBJECT:
-        part = palette.spec.body(PART)
-        add_plate(palette, part, f"marker_{marker.on}", image, side, inverse(marker.T_marker_frame))
-    else:
-        carrier = palette.spec.worldbody.add_body(name=marker.on, mocap=True)
-        add_plate(palette, carrier, f"marker_{marker.on}", image, side, np.eye(4))
+def _add_markers(palette: Palette, markers: Sequence[Marker], materials: Mapping[str, str]) -> None:
+    """Plates, rigidly on what carries them: the furniture's part, or a body that `Scene.pose` moves."""
+    for on in sorted({marker.on for marker in markers}):
+        if on == OBJECT:
+            carrier = palette.spec.body(PART)
+        else:
+            carrier = palette.spec.worldbody.add_body(name=on, mocap=True)
+            box = mount(on, markers)
+            carrier.add_geom(
+                name=box.name,
+                type=mujoco.mjtGeom.mjGEOM_BOX,
+                material=materials[box.material],
+                pos=box.T_frame_box[:3, 3],
+                size=box.half_m,
+                contype=0,
+                conaffinity=0,
+                mass=0.01,
+            )
+        for marker in (m for m in markers if m.on == on):
+            name, image = f"marker_{marker.id}", plate_image(marker.id)
+            add_plate(palette, carrier, name, image, marker.size_m * PLATE, inverse(marker.T_marker_frame))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final, Protocol, runtime_checkable
 
@@ -28,6 +29,13 @@ _GOOD: Final = 0.97  # of the best candidate's score: any such one may be taken
 _MARGIN: Final = 12  # pixels inside the image
 _NEAREST_M: Final = 1.3  # of the camera to the neck: nearer, the person fills the picture
 _GRAZING: Final = 0.2  # cosine between the way to the camera and a front's normal: below it hardly anything is seen
+_READABLE: Final = (0.5, 22.0)
+"""Cosine between the way to the camera and a marker's normal, and pixels of its shorter side, that reading it takes."""
+_HELD_M: Final = 0.2  # between hand and handle
+_WEIGHTS: Final = np.array([0.25, 0.35, 0.3, 0.1])
+"""Of the markers on hand, object and torso, and of the body, in a moment's score."""
+_WEIGHTS_HELD: Final = np.array([0.42, 0.42, 0.1, 0.06])
+"""The same while the hand is at the handle: that is what a demonstration is about."""
 _PANEL: Final = np.array([[0, y, z] for y in (-0.6, 0, 0.6) for z in (-0.6, 0, 0.6)])
 """Points on a front, in halves of its sizes."""
 _CORNERS: Final = np.array([[-1.0, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]])
@@ -72,6 +80,7 @@ class Moves(Protocol):
     def joints(self) -> Float[np.ndarray, "t 18 3"]: ...
     @property
     def acting(self) -> str: ...
+    def carriers(self, i: int) -> Mapping[str, Float[np.ndarray, "4 4"]]: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,10 +102,12 @@ def choose_viewpoint(
     T_object = furniture.articulation.pose(moves.q[moments])
     middle = (moves.joints[moments][:, list(_UPPER)].mean((0, 1)) + T_object[:, :3, 3].mean(0)) / 2
     places = [_candidate(rng, furniture.articulation.T_rest[:3, 3], middle) for _ in range(CANDIDATES)]
-    front = _front(scene)
+    panel = scene.furniture.panel
+    front = transform_points(panel.T_frame_box, _PANEL * panel.half_m)
     score = np.zeros(len(places))
     for moment, T in zip(moments, T_object, strict=True):
-        scene.pose(float(moves.q[moment]))
+        carried = moves.carriers(int(moment)) if scene.markers else {}
+        scene.pose(float(moves.q[moment]), carried=carried)
         sight = _Sight(
             hand[moment, :3, 3],
             T[:3, 3],
@@ -104,6 +115,7 @@ def choose_viewpoint(
             T[:3, 0],
             moves.joints[moment],
             moves.acting,
+            {OBJECT: T, **carried},
         )
         score += [_sees(scene, place, camera, sight) for place in places]
     score /= len(moments)
@@ -120,15 +132,6 @@ def look_at(eye: Float[np.ndarray, "3"], target: Float[np.ndarray, "3"], roll: f
     y = np.cross(z, x)
     c, s = np.cos(roll), np.sin(roll)
     return rigid(np.stack([c * x + s * y, c * y - s * x, z], axis=1), eye)
-
-
-def _front(scene: Scene) -> Float[np.ndarray, "n 3"]:
-    """Points of the moving front that are to be seen, in the handle's frame: its marker, or else all over it."""
-    for marker in scene.markers:
-        if marker.on == OBJECT:
-            return transform_points(inverse(marker.T_marker_frame), marker.size_m / 2 * _CORNERS)
-    panel = scene.furniture.panel
-    return transform_points(panel.T_frame_box, _PANEL * panel.half_m)
 
 
 def _candidate(
@@ -155,6 +158,8 @@ class _Sight:
     """the way that it faces"""
     joints: Float[np.ndarray, "18 3"]
     acting: str
+    carriers: Mapping[str, Float[np.ndarray, "4 4"]]
+    """poses of what carries markers, if there are any"""
 
 
 def _sees(scene: Scene, T_world_cam: Float[np.ndarray, "4 4"], camera: RGBDCamera, sight: _Sight) -> float:
@@ -167,14 +172,37 @@ def _sees(scene: Scene, T_world_cam: Float[np.ndarray, "4 4"], camera: RGBDCamer
     clear = free[:2] & ~_behind_body(eye, targets[:2], sight.joints, sight.acting)
     body = slice(2, 2 + len(upper))
     way = eye - sight.handle
-    flat = (way @ sight.front) / np.linalg.norm(way)  # cosine; markers are on the front
-    panel = free[body.stop :].mean() * (abs(flat) > _GRAZING)
-    if scene.markers:  # all of a marker must be seen, and from the front
-        covered = _behind_body(eye, sight.panel, sight.joints, "")
-        panel = float(free[body.stop :].all() and not covered.any() and flat > _GRAZING)
-    score = 0.25 * clear[0] + 0.1 * clear[1] + 0.25 * panel + 0.25 * free[body].mean() + 0.15 * shown[body].all()
+    flat = abs(way @ sight.front) / np.linalg.norm(way)
+    if scene.markers:
+        read = _readable(scene, T_world_cam, camera, sight)
+        held = np.linalg.norm(sight.hand - sight.handle) < _HELD_M
+        score = (_WEIGHTS_HELD if held else _WEIGHTS) @ (read["hand"], read[OBJECT], read["torso"], free[body].mean())
+    else:
+        panel = free[body.stop :].mean() * (flat > _GRAZING)
+        score = 0.25 * clear[0] + 0.1 * clear[1] + 0.25 * panel + 0.25 * free[body].mean() + 0.15 * shown[body].all()
     too_near = np.linalg.norm(sight.joints[JOINT["neck"]] - eye) < _NEAREST_M or shown[body].mean() < 0.8
     return float(score) - 0.5 * too_near
+
+
+def _readable(
+    scene: Scene, T_world_cam: Float[np.ndarray, "4 4"], camera: RGBDCamera, sight: _Sight
+) -> dict[str, bool]:
+    """Of each thing that carries markers, whether all of one of them is seen well enough to be read."""
+    eye = T_world_cam[:3, 3]
+    T = np.array([sight.carriers[m.on] @ inverse(m.T_marker_frame) for m in scene.markers])
+    sizes = np.array([m.size_m for m in scene.markers])
+    way = eye - T[:, :3, 3]
+    far = np.linalg.norm(way, axis=1)
+    facing = np.sum(way * T[:, :3, 2], axis=1) / far
+    least_cosine, least_px = _READABLE
+    clear = (facing > least_cosine) & (facing * sizes * camera.color.fx / far > least_px)
+    corners = np.einsum("nij,nkj->nki", T[:, :3, :3], sizes[:, None, None] / 2 * _CORNERS) + T[:, None, :3, 3]
+    points = corners[clear].reshape(-1, 3)
+    if len(points):
+        free = _in_images(camera, transform_points(inverse(T_world_cam), points)) & _unblocked(scene, eye, points)
+        free &= ~_behind_body(eye, points, sight.joints, "")
+        clear[clear] = free.reshape(-1, len(_CORNERS)).all(axis=1)
+    return {on: bool(clear[[m.on == on for m in scene.markers]].any()) for on in sight.carriers}
 
 
 def _in_images(camera: RGBDCamera, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
