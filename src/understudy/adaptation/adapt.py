@@ -116,6 +116,11 @@ class _Checked:
         """The base hits nothing."""
         return self.free & self.beside
 
+    @property
+    def failures(self) -> tuple[int, int]:
+        """Samples at which something fails that must not; and at which the base is where the part is."""
+        return int((~(self.free & self.achieved)).sum()), int((~self.beside).sum())
+
 
 class _Adaptation:
     """One call of `adapt`."""
@@ -164,16 +169,17 @@ class _Adaptation:
         return np.repeat(values, [len(d) for d in self.demonstrations])
 
     def tighten(self, graph: Graph, state: State, converged: bool) -> tuple[_Checked, int, list[Iteration], bool]:
-        """Larger margins where exact checks fail, and the last stage again, until nothing fails."""
+        """Larger margins where exact checks fail, the last stage again, until nothing fails; or the best of all."""
         course: list[Iteration] = []
-        stage = self.config.schedule[-1]
+        stage, every = self.config.schedule[-1], list[tuple[_Checked, Problem, np.ndarray]]()
         for round in range(self.config.rounds):
             found = self.checked(state)
             late = self.late(graph, found)
+            every.append((found, graph.problem, self.slower))
             good = found.clear.all() and found.achieved.mean() >= self.config.target_achievable
             if good and (late == 1).all():
                 return found, round, course, converged
-            self.slower *= late
+            self.slower = self.slower * late
             graph.stretch(self.per_step(late))
             graph.reach_margin[_widened(~found.achieved)] += _REACH_STEP
             graph.map_stiffness[_widened(~found.free)] *= _STIFFER
@@ -182,7 +188,9 @@ class _Adaptation:
                 graph.obstacle_margin += _OBSTACLE_STEP
             state, part, converged = _solve(graph, state, stage, len(self.config.schedule) + round)
             course += part
-        return self.checked(state), self.config.rounds, course, converged
+        every.append((self.checked(state), graph.problem, self.slower))
+        found, graph.problem, self.slower = min(every, key=lambda one: one[0].failures)
+        return found, self.config.rounds, course, converged
 
     def late(self, graph: Graph, found: _Checked) -> Float[np.ndarray, " d"]:
         """By how much to slow down further: 1 where no grasp is missed and nothing is hit for lack of time."""
@@ -271,12 +279,15 @@ class _Adaptation:
 
     def refuse(self, graph: Graph, found: _Checked) -> None:
         """Raises InfeasibleError for a result that the robot cannot do; notes what it can nearly do."""
-        clear, achieved = found.clear, found.achieved
+        clear, achieved = found.free, found.achieved
         off, turned = graph.missed(found.state).max(axis=0)
         held = max(off, turned) <= _LOOSE
         if held and clear.all() and achieved.mean() >= self.config.least_achievable:
             if achieved.mean() < self.config.target_achievable:
                 self.notes.append(f"{100 * achieved.mean():.2f} % of the samples are achievable")
+            if not found.beside.all():
+                # the map is measured; of the part, outline and depth are guessed where it was not seen
+                self.notes.append(f"the base is where the moving part is at {int((~found.beside).sum())} samples")
             return
         good = clear & achieved
         failing = {i: int((~good[s]).sum()) for i, (s, _) in enumerate(self.each()) if not good[s].all()}
