@@ -29,7 +29,10 @@ from understudy.files import write_atomically
 def main(arguments: Sequence[str] | None = None) -> None:
     chosen = parse(arguments)
     truths = [from_stage(folder) for folder in chosen.recordings]
-    configs = [DemonstrationConfig(truth.task, chosen.object, chosen.teacher, chosen.markers) for truth in truths]
+    configs = [
+        DemonstrationConfig(truth.task, chosen.object, chosen.teacher, marker_file(chosen, folder))
+        for truth, folder in zip(truths, chosen.recordings, strict=True)
+    ]
     begin, used = time.perf_counter(), processor_s()
     results = demonstrate(
         chosen.recordings, chosen.work, configs, hands=chosen.hands, progress=True, report=complain, jobs=chosen.jobs
@@ -77,6 +80,13 @@ def processor_s() -> float:
     return sum(os.times()[:4])
 
 
+def marker_file(chosen: argparse.Namespace, folder: str) -> str | None:
+    """Which marker is on what: as given, or the recording's own."""
+    if chosen.markers or "markers" not in (chosen.object, chosen.teacher):
+        return chosen.markers
+    return str(Path(folder) / "markers.json")
+
+
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("recordings", nargs="+", help="folders of `understudy stage record`")
@@ -84,7 +94,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--out", type=Path, help="folder for README.md")
     parser.add_argument("--object", default="rgbd")
     parser.add_argument("--teacher", default="rgbd")
-    parser.add_argument("--markers")
+    parser.add_argument("--markers", help="which marker is on what; default: each recording's own markers.json")
     parser.add_argument("--hands", default="full")
     parser.add_argument("--jobs", type=int, help="recordings at a time (default: one a processor)")
     return parser.parse_args(arguments)

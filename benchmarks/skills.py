@@ -113,9 +113,9 @@ def page(work: Path, seed: int) -> str:
         "",
         *lines,
         "",
-        f"Layouts of seed {seed} (`understudy trials --seed {seed}`): the same for all rows of a task. Of: demonstrations "
-        "that it was learnt from, and that there were. Opened, N (largest force between gripper and part), wall s "
-        "(planning and simulation): medians; in brackets the share of trials within 10 s. Interval: Wilson.",
+        f"Layouts of seed {seed} (`understudy trials --seed {seed}`): the same for all rows of a task. Of: "
+        "demonstrations that it was learnt from, and that there were. Opened, N (greatest force on the part), "
+        "wall s (planning and simulation): medians; in brackets the share of trials within 10 s. Interval: Wilson.",
         "",
         machine(),
     ]  # fmt: skip
