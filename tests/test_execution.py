@@ -285,8 +285,8 @@ def test_trials_resume_and_refuse_foreign_results(
             raise KeyboardInterrupt
         ran.append(setup.seed)
         return Outcome(
-            setup.seed != 102_001, Reason.OPENED if setup.seed != 102_001 else Reason.LOST, "", 0.95, 0, (), 20.0, (), (),
-            15.0, 1.0, opened.trajectory,
+            setup.seed != 102_001, Reason.OPENED if setup.seed != 102_001 else Reason.LOST, "", 0.95, 0, (), 20.0, (),
+            (), 15.0, 1.0, opened.trajectory,
         )  # fmt: skip
 
     monkeypatch.setattr(trials, "run_trial", fake)
