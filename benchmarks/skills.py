@@ -31,6 +31,7 @@ from understudy.execution import trials
 from understudy.execution.imitation import imitation_plan, unadapted
 from understudy.execution.planning import make_plan
 from understudy.files import write_atomically
+from understudy.robot import load_robot
 from understudy.teaching_motions import robot_motions
 
 ROWS = {
@@ -71,6 +72,7 @@ def first_feasible(shown: list[Demonstration], platform: Platform) -> list[Demon
 def main(arguments: Sequence[str] | None = None) -> None:
     """Runs what has not been run yet; writes the table of all that has."""
     chosen = parse(arguments)
+    shows = platform_of(load_robot("pr2"))  # as `understudy teach` adapts to it
     robot = trials.trial_robot("pr2")
     platform = platform_of(robot)
     shown = {"rgbd": load_all([chosen.demonstrations])}
@@ -83,7 +85,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
                 print(f"{task}, {row}: no demonstrations")
                 continue
             folder = chosen.work / row / task
-            skill = learnt(task, row, source, platform, folder)
+            skill = learnt(task, row, source, shows, folder)
             results = trials.run_trials(
                 skill, robot, platform, trials.setups(task, chosen.n, chosen.seed),
                 chosen.work / row / f"trials-{chosen.seed}",
