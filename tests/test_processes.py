@@ -74,13 +74,18 @@ def test_warnings_of_the_processes_are_warnings_here(tmp_path):
         assert run(tmp_path, 1, "warns")[0][0].startswith("warns")
 
 
+def heard() -> None:
+    """Where the tests run in the background of a script, an interruption would be ignored by all that they start."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 def started(folder: Path, *names: str) -> subprocess.Popen:
     """Another program that makes these in two processes, and has begun."""
     code = f"from test_processes import *\nrun(Path({str(folder)!r}), 2, *{names!r})"  # there is no main module
     path = os.pathsep.join([str(Path(__file__).parent), *sys.path])
     process = subprocess.Popen(
         [sys.executable, "-c", code], env={**os.environ, "PYTHONPATH": path}, start_new_session=True,
-        stderr=subprocess.PIPE, text=True,
+        stderr=subprocess.PIPE, text=True, preexec_fn=heard,
     )  # fmt: skip
     until(lambda: all((folder / name / "begun").exists() for name in names))
     return process
