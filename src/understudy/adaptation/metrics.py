@@ -141,10 +141,7 @@ def evaluate(demonstrations: Sequence[Demonstration], result: AdaptationResult, 
 
 
 def _before(d: Demonstration, grasp: Float[np.ndarray, "4 4"], result: AdaptationResult, robot: Platform) -> _Path:
-    target, _ = prepare.hand_targets(d, result.calibration.hand_tool(d.acting))
-    seen = np.isfinite(target).all(axis=(1, 2))
-    tool = prepare.bridged(target, seen) if seen.any() else prepare.object_path(d) @ grasp
-    base = prepare.first_base(d, result.calibration.torso_base)
+    tool, base = prepare.as_shown(d, result.calibration, grasp)
     torso, joints = np.full(len(d), robot.torso_rest), None
     if robot.arm is not None:
         seen_from_base = lie.se3_inverse(lie.se2_to_se3(base)) @ tool

@@ -209,6 +209,18 @@ def bridged(T: Float[np.ndarray, "t 4 4"], good: Bool[np.ndarray, " t"]) -> Floa
     return T[a] @ lie.se3_exp(share[:, None] * lie.se3_log(lie.se3_inverse(T[a]) @ T[b]))
 
 
+def as_shown(
+    d: Demonstration, calibration: Calibration, grasp: Float[np.ndarray, "4 4"]
+) -> tuple[Float[np.ndarray, "t 4 4"], Float[np.ndarray, "t 3"]]:
+    """Gripper H X and base P Y, unadapted, gaps bridged. Where no hand was seen at all, the gripper stays on the object
+    with T_object_tool = grasp.
+    """
+    target, _ = hand_targets(d, calibration.hand_tool(d.acting))
+    seen = np.isfinite(target).all(axis=(1, 2))
+    tool = bridged(target, seen) if seen.any() else object_path(d) @ grasp
+    return tool, first_base(d, calibration.torso_base)
+
+
 def first_base(demonstration: Demonstration, torso_base: Float[np.ndarray, "3"]) -> Float[np.ndarray, "t 3"]:
     """P Y with gaps bridged. Where no torso was seen at all: an arm's length before the object's front, facing it."""
     target, _ = base_targets(demonstration, torso_base)

@@ -40,13 +40,12 @@ def unadapted(
 
 
 def _followed(d: Demonstration, adapted: Adapted, result: AdaptationResult, platform: Platform) -> Adapted:
-    target, _ = prepare.hand_targets(d, result.calibration.hand_tool(d.acting))
-    seen = np.isfinite(target).all(axis=(1, 2))
+    tool, base = prepare.as_shown(d, result.calibration, adapted.grasp)
     return replace(
         adapted,
         times_s=d.times_s,
-        T_world_tool=prepare.bridged(target, seen),
-        base=prepare.first_base(d, result.calibration.torso_base),
+        T_world_tool=tool,
+        base=base,
         torso=np.full(len(d), platform.torso_rest),
         joints=None,
     )

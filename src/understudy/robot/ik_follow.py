@@ -14,14 +14,12 @@ from jaxtyping import Bool, Float
 from understudy.errors import UnderstudyError
 from understudy.robot.ik import LENGTH, IKProblem, pose_distance
 from understudy.robot.ik_kernels import follow_branches
-from understudy.robot.ik_path import IKPath, velocity_share
+from understudy.robot.ik_path import JUMP_RAD, IKPath, velocity_share
 from understudy.robot.model import Robot
 
 _STARTS: Final = 5
 """samples whose solutions are followed, both ends among them"""
 _SEEDS, _SOLUTIONS = 48, 8  # at each of them
-_JUMP: Final = 0.5
-"""radians of one joint between samples: the branch is not followed there, but changed"""
 
 
 def follow_ik_path(
@@ -83,7 +81,7 @@ def _branches(problem: IKProblem) -> tuple[Float[np.ndarray, "b t k"], Bool[np.n
 def _jumps(paths: Float[np.ndarray, "b t k"]) -> Bool[np.ndarray, "b t"]:
     """Samples that are not reached from the one before by a small motion."""
     step = np.abs(np.diff(paths[..., 1:], axis=1)).max(axis=2, initial=0.0)
-    return np.pad(step > _JUMP, ((0, 0), (1, 0)))
+    return np.pad(step > JUMP_RAD, ((0, 0), (1, 0)))
 
 
 def _greatest(
