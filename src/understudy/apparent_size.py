@@ -44,7 +44,8 @@ _MODE = 0.95 * _MODE  # jitter lengthens bones; that of the fit was more than Bl
 _NORM = _ABOVE * np.sqrt(np.pi / 2) + _BELOW
 _WRONG = 0.03 / 4  # density of a bone with a misplaced end
 _POWER = -0.4  # bones of one person err together: n of them count as n ** (1 - 0.4)
-_GRID = np.linspace(np.log(DISTANCES[0]), np.log(DISTANCES[1]), 140)
+LOG_DISTANCES: Final = np.linspace(np.log(DISTANCES[0]), np.log(DISTANCES[1]), 140)
+"""where likelihoods of a distance are tabulated: logarithms of metres"""
 
 
 def distance_of_size(ray: Float[np.ndarray, "18 2"]) -> tuple[float, float] | None:
@@ -54,16 +55,30 @@ def distance_of_size(ray: Float[np.ndarray, "18 2"]) -> tuple[float, float] | No
     Mean and standard deviation of the posterior of the log distance, all distances of `DISTANCES` being equally likely
     before. None where no bone has both ends. On simulated detections of most of the body, off by 12 % (one sigma).
     """
+    likely = size_log_likelihood(ray)
+    return None if likely is None else distance_of(likely)
+
+
+def distance_of(log_likelihood: Float[np.ndarray, "140"]) -> tuple[float, float]:
+    """Metres at the mean of the log distance, and one sigma of its logarithm; given at `LOG_DISTANCES`."""
+    share = softmax(log_likelihood)
+    mean = (share * LOG_DISTANCES).sum()
+    return float(np.exp(mean)), float(np.sqrt((share * (LOG_DISTANCES - mean) ** 2).sum()))
+
+
+def size_log_likelihood(ray: Float[np.ndarray, "18 2"]) -> Float[np.ndarray, "140"] | None:
+    """How likely the bones look as they do from each of `LOG_DISTANCES`; None where no bone has both ends.
+
+    ray: as for `distance_of_size`.
+    """
     direction = np.concatenate([ray, np.ones((len(ray), 1))], axis=1)
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     angle = np.linalg.norm(direction[_ENDS[:, 0]] - direction[_ENDS[:, 1]], axis=1)
     ok = angle > 0  # False for NaN
     if not ok.any():
         return None
-    off = np.log(angle[ok])[:, None] + _GRID - np.log(_MODE[ok])[:, None]
+    off = np.log(angle[ok])[:, None] + LOG_DISTANCES - np.log(_MODE[ok])[:, None]
     density = np.exp(np.where(off > 0, -0.5 * (off / _ABOVE[ok, None]) ** 2, off / _BELOW[ok, None]))
     density /= _NORM[ok, None]
-    likely = ok.sum() ** _POWER * np.log(0.97 * density + _WRONG).sum(0)
-    share = softmax(likely)
-    mean = (share * _GRID).sum()
-    return float(np.exp(mean)), float(np.sqrt((share * (_GRID - mean) ** 2).sum()))
+    likely: Float[np.ndarray, "140"] = ok.sum() ** _POWER * np.log(0.97 * density + _WRONG).sum(0)
+    return likely

@@ -47,7 +47,7 @@ class Floor:
 
 def find_floor(points: Float32[np.ndarray, "n 3"] | None, people: Sequence[Person]) -> Floor:
     """The floor among measured points; without one, level with the camera and under the people's lowest joints."""
-    return (None if points is None else _fit(points.astype(np.float64))) or _under(people)
+    return (None if points is None else measured_floor(points)) or _under(people)
 
 
 def _under(people: Sequence[Person]) -> Floor:
@@ -56,12 +56,15 @@ def _under(people: Sequence[Person]) -> Floor:
     return Floor(CAMERA_UP, -(float(lowest.max()) + 0.08) if len(lowest) else -1.5, seen=False)
 
 
-def _fit(points: Float[np.ndarray, "n 3"]) -> Floor | None:
-    """The plane through most points that nearly all others are above (random triples, then least squares)."""
+def measured_floor(points: Float32[np.ndarray, "n 3"]) -> Floor | None:
+    """The plane through most points that nearly all others are above (random triples, then least squares).
+
+    points: colour camera's frame, metres. None where nothing measured looks like a floor.
+    """
     if len(points) < 200:
         return None
     random = np.random.default_rng(0)
-    points = points[random.permutation(len(points))[:_SAMPLES]]
+    points = points[random.permutation(len(points))[:_SAMPLES]].astype(np.float64)
     some = random.integers(len(points), size=(3, _TRIES))
     low = np.argsort(-points[:, 1])[: int(_LOW * len(points))]  # where little of the floor is to be seen, it is there
     some[:, ::2] = low[random.integers(len(low), size=some[:, ::2].shape)]

@@ -2,20 +2,24 @@
 
 The paper takes the depth at the neck, else at a hip. That puts the root on whatever stands in front of that one joint.
 Here all torso joints and places between them vote, and so does the apparent size: a person of whom all bones come out
-far too short has had the depth of something nearer to the camera.
+far too short has had the depth of something nearer to the camera. Whom the depth camera did not measure is placed by
+apparent size and by the joints' heights over the floor.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
 
-from understudy.apparent_size import distance_of_size
+from understudy.apparent_size import distance_of, size_log_likelihood
 from understudy.camera import Camera
+from understudy.floor import Floor
 from understudy.lifting import nearest_depths
 from understudy.skeleton import JOINT, N_JOINTS, TORSO, rows
+from understudy.standing import floor_log_likelihood
 from understudy.types import Keypoints2D, RegisteredDepth
 
 _USUAL = 2.5  # metres: the distance of a person of whom nothing tells it
@@ -49,13 +53,20 @@ class Root:
     support: float
     """share of the votes, 0 to 1: depths at the person that agree with it, and how credible it makes the size"""
     evidence: str
-    """`depth`, or `size`: no depth was near the person that its apparent size allows"""
+    """`depth`, or `size`: no depth was near the person that its apparent size (and the floor under it) allows"""
 
 
-def find_roots(person: Keypoints2D, depth: RegisteredDepth, camera: Camera, min_score: float = 0.2) -> list[Root]:
+def find_roots(
+    person: Keypoints2D,
+    depth: RegisteredDepth,
+    camera: Camera,
+    min_score: float = 0.2,
+    floor: Callable[[], Floor | None] = lambda: None,
+) -> list[Root]:
     """Where the person may be, the likeliest place first; nearly always one. Empty only without 2D keypoints.
 
-    min_score: keypoints with a lower score are not used, unless there are no others.
+    min_score: keypoints with a lower score are not used, unless there are no others. floor: called only for somebody
+    whom no depth fits; gives the measured floor, if there is one.
     """
     found = person.found & np.isfinite(camera.normalized(person.uv)).all(1)
     usable = found & (person.score >= min_score)
@@ -65,10 +76,12 @@ def find_roots(person: Keypoints2D, depth: RegisteredDepth, camera: Camera, min_
         return []
     uv = np.where(usable[:, None], person.uv, np.nan)
     ray = camera.normalized(uv)
-    sized, sigma = _depth_of_size(ray)
     trunk = np.median(nearest_depths(depth, camera, _on_trunk(uv)), axis=1)
     limbs = np.median(nearest_depths(depth, camera, uv[_LIMBS]), axis=1)
-    places = _elected(np.concatenate([trunk, [person.torso_z or np.nan], limbs, [sized]]), sigma)
+    measured = np.concatenate([trunk, [person.torso_z or np.nan], limbs])
+    places = _elected(measured, *_unmeasured_depth(ray))
+    if any(kind == "size" for *_, kind in places) and (plane := floor()):
+        places = _elected(measured, *_unmeasured_depth(ray, floor_log_likelihood(ray, plane)))
     if not places:  # nothing to measure the keypoints by: any depth is better than none
         values = nearest_depths(depth, camera, uv, k=1, radius=0.1)
         near = values[np.isfinite(values)]
@@ -86,30 +99,34 @@ def _on_trunk(uv: Float[np.ndarray, "18 2"]) -> Float[np.ndarray, "9 2"]:
     return np.where(_PLACES[..., None] > 0, _PLACES[..., None] * corners, 0.0).sum(1)
 
 
-def _depth_of_size(ray: Float[np.ndarray, "18 2"]) -> tuple[float, float]:
-    """z of the trunk at the person's apparent distance, and one sigma of its log; NaN where nothing tells it."""
-    found = distance_of_size(ray)
-    if found is None:
+def _unmeasured_depth(ray: Float[np.ndarray, "18 2"], stands: np.ndarray | None = None) -> tuple[float, float]:
+    """z of the trunk at the person's apparent distance, and one sigma of its log; NaN where nothing tells it.
+
+    stands: log likelihood of `LOG_DISTANCES` by what the floor says.
+    """
+    said = [likely for likely in (size_log_likelihood(ray), stands) if likely is not None]
+    if not said:
         return np.nan, np.nan
-    distance, sigma = found
+    distance, sigma = distance_of(np.sum(said, axis=0))
     torso = ray[TORSO]
     torso = torso[np.isfinite(torso).all(1)]
     middle = torso.mean(0) if len(torso) else np.nanmean(ray, axis=0)
     return distance / float(np.sqrt(1 + middle @ middle)), sigma
 
 
-def _elected(values: np.ndarray, sigma: float) -> list[tuple[float, float, str]]:
-    """The depths on which most of `values` agree, their share of the votes, and the evidence; the best first.
+def _elected(measured: np.ndarray, sized: float, sigma: float) -> list[tuple[float, float, str]]:
+    """The depths on which most of all agree, their share of the votes, and the evidence; the best first.
 
-    The last value is that of the apparent size, with one sigma of its log.
+    sized: the depth at the apparent distance, with one sigma of its log.
 
     Each value votes for those near it. What would make the person a dwarf or a giant counts less, so that a few depths
     of an occluder or of the background do not outvote the rest, but many that agree win over a wrong size. A bone may
     look too short because it points along the view; it has no such excuse for looking too long.
     """
+    values = np.append(measured, sized)
     valid = np.isfinite(values)
     chosen, weights = values[valid], _WEIGHTS[valid]
-    measured = np.arange(len(values))[valid] < len(values) - 1
+    is_measured = np.arange(len(values))[valid] < len(measured)
     credible = np.ones(len(chosen))
     if valid[-1]:
         off = np.log(chosen / values[-1])
@@ -121,7 +138,7 @@ def _elected(values: np.ndarray, sigma: float) -> list[tuple[float, float, str]]
     least = _RIVAL * votes.max(initial=0)
     while len(places) < _MOST and len(votes) and votes.max() > least:
         best = int(np.argmax(votes))
-        voters = near[best] & measured
+        voters = near[best] & is_measured
         z = float(np.median(chosen[voters]) if voters.any() else chosen[best])
         places.append((z, float(support[best]), "depth" if voters.any() else "size"))
         votes = np.where(np.abs(chosen - places[-1][0]) < _APART, -1.0, votes)

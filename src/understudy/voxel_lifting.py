@@ -7,14 +7,17 @@ it believes most wins.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float32
 from scipy.special import logit
 
 from understudy import voxels
 from understudy.assembly import ASSEMBLIES, Rows
 from understudy.errors import UnderstudyError, one_of
+from understudy.floor import Floor, measured_floor
 from understudy.roots import Root, find_roots
 from understudy.skeleton import TORSO
 from understudy.types import INFERRED, OBSERVED, Keypoints2D, Person, RegisteredFrame
@@ -39,9 +42,15 @@ class VoxelLifter:
     def lift(self, frame: RegisteredFrame, people: Sequence[Keypoints2D]) -> list[Person]:
         if not people:
             return []
-        roots = [find_roots(person, frame.depth, frame.camera, self.min_score) for person in people]
+        cloud = voxels.cloud(frame.depth, voxels.ENOUGH)
+
+        @cache
+        def floor() -> Floor | None:
+            return measured_floor(cloud)
+
+        roots = [find_roots(person, frame.depth, frame.camera, self.min_score, floor) for person in people]
         each = [(person, root) for person, several in zip(people, roots, strict=True) for root in several]
-        lifted = iter(self._lift(frame, each))
+        lifted = iter(self._lift(frame, cloud, each))
         candidates = [[next(lifted) for _ in r] for r in roots]
         chosen = choose(candidates, roots)
         return [
@@ -49,12 +58,13 @@ class VoxelLifter:
             for person, several, k in zip(people, candidates, chosen, strict=True)
         ]
 
-    def _lift(self, frame: RegisteredFrame, each: Sequence[tuple[Keypoints2D, Root]]) -> list[Person]:
-        """Every pair of a person and a place."""
+    def _lift(
+        self, frame: RegisteredFrame, cloud: Float32[np.ndarray, "n 3"], each: Sequence[tuple[Keypoints2D, Root]]
+    ) -> list[Person]:
+        """Every pair of a person and a place. cloud: the frame's points, see `voxels.cloud`."""
         if not each:
             return []
         views = [PersonView.towards(root.point) for _, root in each]
-        cloud = voxels.cloud(frame.depth, voxels.ENOUGH)
         depth = np.stack([view.depth_grid(cloud) for view in views])
         rows = np.stack(
             [keypoint_input(v, frame.camera, p, self.min_score) for v, (p, _) in zip(views, each, strict=True)]

@@ -117,7 +117,7 @@ class Samples:
         """Batch `number`: of somewhat more people, the first `size` that a detector would find."""
         b = size + 1 + size // 32
         draw = Draw((self.seed * 1_000_003 + number) % 2**63, self.device)
-        people = self._people(draw, b)
+        people = self.people(draw, b)
         rig = Rig(draw, self.config.sensors, b)
         cameras = self._cameras(draw, people, rig)
         boxes = place_boxes(draw, self.config.scene, cameras, people.joints, people.sits)
@@ -137,7 +137,7 @@ class Samples:
             cameras = cameras.where(enough, drawn())
         return cameras
 
-    def _people(self, draw: Draw, b: int) -> People:
+    def people(self, draw: Draw, b: int) -> People:
         """Posed bodies on the floor at the world's origin, turned at random."""
         ids = draw.integers(len(self.bank), b)
         if self.poses is None:

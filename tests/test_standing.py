@@ -1,0 +1,99 @@
+"""Distance over a measured floor: right for drawn people, and better than the size alone for tall and short ones."""
+
+import numpy as np
+import pytest
+from test_apparent_size import BODY
+from test_roots import CAMERA
+
+from understudy.apparent_size import distance_of, size_log_likelihood
+from understudy.floor import Floor
+from understudy.roots import find_roots
+from understudy.skeleton import JOINT, JOINTS, N_JOINTS
+from understudy.standing import floor_log_likelihood
+from understudy.types import Keypoints2D, RegisteredDepth
+
+ANKLE, HIPS = 0.11, 0.79  # metres: ankles over the floor, hips over the ankles
+UP = np.array([0.0, -1.0, 0.0])
+
+
+def standing(distance: float, camera: float, size: float = 1.0) -> np.ndarray:
+    """Joints (metres, level camera `camera` metres over the floor) of somebody `size` times as large as an adult."""
+    x, y = np.array([BODY[n.split("_")[-1]] for n in JOINTS]).T
+    x = np.where([n.startswith("right") for n in JOINTS], -x, x)
+    down = camera - size * (HIPS + ANKLE - y)
+    return np.column_stack([size * x, down, np.full(N_JOINTS, distance)])
+
+
+def pitched(angle: float) -> np.ndarray:
+    """R_cam_level of a camera that looks down by `angle` radians."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[1, 0, 0], [0, c, -s], [0, s, c]])
+
+
+def rays(points: np.ndarray) -> np.ndarray:
+    return points[:, :2] / points[:, 2:]
+
+
+def judged(distance: float, camera: float, size: float = 1.0, pitch: float = 0.0) -> tuple[float, float]:
+    R = pitched(pitch)
+    ray = rays(standing(distance, camera, size) @ R.T)
+    said = floor_log_likelihood(ray, Floor(R @ UP, -camera))
+    assert said is not None
+    return distance_of(said)
+
+
+@pytest.mark.parametrize("pitch", [0.0, 0.35])
+@pytest.mark.parametrize("camera", [0.6, 1.2, 2.0])
+@pytest.mark.parametrize("distance", [1.5, 3.0, 5.0])
+def test_who_stands_is_where_the_floor_says(distance: float, camera: float, pitch: float):
+    """Turned by the same pitch, camera and floor say the same."""
+    found, sigma = judged(distance, camera, pitch=pitch)
+    true = np.linalg.norm(standing(distance, camera)[[JOINT["neck"], JOINT["right_hip"], JOINT["left_hip"]]].mean(0))
+    assert abs(np.log(found / true)) < 0.1
+    assert sigma < 0.2
+
+
+@pytest.mark.parametrize("size", [0.86, 1.14])
+def test_tall_and_short_people(size: float):
+    """Their size alone puts them wrong by how far it is from the usual one; the floor takes most of that back."""
+    camera, distance = 1.4, 3.0
+    ray = rays(standing(distance, camera, size))
+    sized = size_log_likelihood(ray)
+    said = floor_log_likelihood(ray, Floor(UP, -camera))
+    alone, together = (abs(np.log(distance_of(x)[0] / distance)) for x in (sized, sized + said))
+    assert alone > 0.1
+    assert together < 0.6 * alone
+
+
+def test_nothing_to_go_by():
+    floor = Floor(UP, -1.2)
+    assert floor_log_likelihood(np.full((N_JOINTS, 2), np.nan), floor) is None
+    arm = np.full((N_JOINTS, 2), np.nan)
+    arm[JOINT["left_wrist"]] = 0.1
+    assert floor_log_likelihood(arm, floor) is None
+    steep = pitched(1.5)
+    assert floor_log_likelihood(rays(standing(3.0, 1.2)), Floor(steep @ UP, -1.2)) is None
+
+
+@pytest.mark.parametrize("size", [0.87, 1.0, 1.13])
+def test_a_root_outside_the_depth_image(size: float):
+    """The floor is measured, the person is not: as beside the narrower image of a Kinect's depth camera."""
+    camera, distance = 1.1, 3.0
+    points = standing(distance, camera, size)
+    v, _ = np.mgrid[0:540, 0:960].astype(np.float64)
+    slope = (v - 269.5) / 540.7
+    z = np.where(slope > 0.1, camera / np.maximum(slope, 0.1), 0.0)
+    z[:, 380:580] = 0  # nothing around the person
+    depth = RegisteredDepth(z.astype(np.float32), CAMERA)
+    who = Keypoints2D.where(CAMERA.project(points), np.full(N_JOINTS, 0.9))
+    asked = []
+
+    def floor() -> Floor:
+        asked.append(1)
+        return Floor(UP, -camera)
+
+    without, with_it = (find_roots(who, depth, CAMERA, floor=f)[0] for f in (lambda: None, floor))
+    assert with_it.evidence == "size" and len(asked) == 1
+    off = [abs(root.point[2] / distance - 1) for root in (without, with_it)]
+    assert off[1] < 0.1
+    assert size == 1.0 or off[1] < 0.7 * off[0]
