@@ -203,15 +203,27 @@ def test_the_page_and_its_plots(group, tmp_path):
     pytest.importorskip("matplotlib")
     trainings = Trainings(("anny",), ("kitchen",), ("capsules: left out",), {"anny": 5120})
     write_report(tmp_path, [group], trainings, ["mlp: left out"])
-    page = (tmp_path / "README.md").read_text()
+    page, other = ((tmp_path / name).read_text() for name in ("README.md", comparison_report.TRAININGS))
     good, some = (17 * 0.95 + 18 * 0.4) / 35, (17 * 0.9 + 16 * 0.6) / 35
-    assert f"| anny | 5,120 | {good:.3f} (6.7) |" in page and "These runs are shorter" in page
-    assert f"| kitchen, Kitchen | - | {some:.3f} (4.9) | {good:.3f} (6.7) |" in page
+    assert f"| anny | 5,120 | {good:.3f} (6.7) |" in other and "These runs are shorter" in other
+    assert f"| kitchen, Kitchen | - | {some:.3f} (4.9) | {good:.3f} (6.7) |" in other
+    assert f"({comparison_report.TRAININGS})" in page
     assert "- mlp: left out\n- capsules: left out" in page and "Not detected: 1 people" in page
     assert f"| {OURS} on true 2D |" in page
     for name in PLOTS:
         png = (tmp_path / f"kitchen-{name}.png").read_bytes()
         assert png.startswith(PNG) and len(png) > 10_000 and f"(kitchen-{name}.png)" in page
+
+
+def test_the_page_on_trainings_stays_until_there_are_others(group, tmp_path, monkeypatch):
+    monkeypatch.setattr(comparison_report, "draw", lambda group: {})
+    write_report(tmp_path, [group], Trainings(), [])
+    assert not (tmp_path / comparison_report.TRAININGS).exists()
+    assert comparison_report.TRAININGS not in (tmp_path / "README.md").read_text()
+    (tmp_path / comparison_report.TRAININGS).write_text("of last week")
+    write_report(tmp_path, [group], Trainings(), [])
+    assert (tmp_path / comparison_report.TRAININGS).read_text() == "of last week"
+    assert f"({comparison_report.TRAININGS})" in (tmp_path / "README.md").read_text()
 
 
 def test_missing_weights_are_noted(tmp_path):

@@ -1,4 +1,4 @@
-"""A comparison as a page: README.md with tables and definitions, and its plots as PNG."""
+"""A comparison as pages: README.md with tables and definitions, its plots as PNG, and trainings.md."""
 
 from __future__ import annotations
 
@@ -71,19 +71,33 @@ def held_out_name(sensor: str) -> str:
 
 
 def write_report(out: Path, groups: Sequence[Group], trainings: Trainings, notes: Sequence[str]) -> None:
-    """README.md and the plots of every group."""
+    """README.md, the plots of every group, and trainings.md if other trainings were run.
+
+    Otherwise a page on trainings that is there stays: it says itself when and with what it was made.
+    """
     parts = ["# Comparison of methods", _INTRODUCTION]
     for group in groups:
         for name, png in draw(group).items():
             write_atomically(out / name, png)
         parts += list(_group(group))
-    parts += ["## What the network was trained on", *_trainings(groups, trainings)]
+    ran = ["## Where it ran", environment_lines(environment())]
     left_out = [*notes, *trainings.notes]
+    if trainings.bodies or trainings.without:
+        page = ["# What the network was trained on", _TRAININGS, *_trainings(groups, trainings), *ran]
+        write_atomically(out / TRAININGS, "\n\n".join(page) + "\n")
+    if (out / TRAININGS).exists():
+        parts.append(f"Other body sets in training, and a sensor kept out of it: [{TRAININGS}]({TRAININGS}).")
     if left_out:
         parts += ["## Left out", "\n".join(f"- {n}" for n in left_out)]
-    parts += ["## What the numbers mean", _DEFINITIONS, "## Where it ran", environment_lines(environment())]
+    parts += ["## What the numbers mean", _DEFINITIONS, *ran]
     write_atomically(out / "README.md", "\n\n".join(parts) + "\n")
 
+
+TRAININGS: Final = "trainings.md"
+_TRAININGS = (
+    "Written by `benchmarks/paper_tables.py` when it is given such runs; the test recordings and definitions are those "
+    "of [README.md](README.md)."
+)
 
 _INTRODUCTION = (
     "Written by `benchmarks/paper_tables.py` (the command is at the end); made anew, not edited. The tables and "
@@ -279,5 +293,3 @@ def _trainings(groups: Sequence[Group], trainings: Trainings) -> Iterator[str]:
             for g in groups
         ]
         yield markdown_lines(["sensor", "people shown", "trained without it", f"{OURS} (trained with it)"], rows)
-    if not (trainings.bodies or trainings.without):
-        yield "No other trainings were given (see below)."

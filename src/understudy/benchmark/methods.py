@@ -17,7 +17,10 @@ from understudy.lifting import Lifter, NaiveLifter
 OURS, NO_ASSEMBLY, PAPER_ASSEMBLY = "voxelposenet", "voxelposenet, no assembly", "voxelposenet, paper's assembly"
 
 _COMMON = ("camera", "geometry", "lifting", "registration", "skeleton", "types")
-_VOXELS = ("roots", "voxels", "voxel_lifting", "assembly", "runtime", "voxelposenet/predictor")
+_VOXELS = (
+    "floor", "apparent_size", "standing", "roots", "voxels", "voxel_lifting", "assembly", "runtime",
+    "voxelposenet/predictor",
+)  # fmt: skip
 _PAPER = ("voxelposenet/paper_grid", "voxelposenet/paper_net", "voxelposenet/paper_lifter")
 
 
