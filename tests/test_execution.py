@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import gc
 import json
 from functools import partial
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import pytest
@@ -23,6 +25,7 @@ from understudy.adaptation.platform import Platform  # noqa: E402
 from understudy.demonstration.demonstration import OCCUPIED  # noqa: E402
 from understudy.errors import MissingExtraError, UnderstudyError  # noqa: E402
 from understudy.execution import trials  # noqa: E402
+from understudy.execution.clearance import Around, GuardedRobot  # noqa: E402
 from understudy.execution.control import Arm, HandleEstimate  # noqa: E402
 from understudy.execution.execution import Config, Execution  # noqa: E402
 from understudy.execution.imitation import imitation_plan, unadapted  # noqa: E402
@@ -31,6 +34,7 @@ from understudy.execution.planning import make_plan  # noqa: E402
 from understudy.execution.surroundings import observe  # noqa: E402
 from understudy.execution.timing import time_scaled  # noqa: E402
 from understudy.geometry import inverse  # noqa: E402
+from understudy.robot import ik  # noqa: E402
 from understudy.robot.model import Robot  # noqa: E402
 from understudy.robot.simulator import Noise, Simulator  # noqa: E402
 from understudy.stage.furniture import sample_furniture  # noqa: E402
@@ -134,6 +138,28 @@ def test_plans_nothing_that_the_robot_cannot_do(drawer: ActionModel, robot: Robo
     wanted = furniture.articulation.pose(x[hold, -1]) @ plan.grasp
     assert np.linalg.norm(tool[:, :3, 3] - wanted[:, :3, 3], axis=1).max() < 0.01
     assert np.abs(v[[0, -1]]).max() < 1e-6
+
+
+def test_tables_of_the_robot_are_made_once_however_often_it_is_guarded(
+    robot: Robot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made, init = [], ik.SeedTable.__init__
+
+    def counted(self: ik.SeedTable, robot: Robot) -> None:
+        made.append(robot)
+        init(self, robot, 100)
+
+    monkeypatch.setattr(ik, "_tables", WeakKeyDictionary())
+    monkeypatch.setattr(ik.SeedTable, "__init__", counted)
+    furniture = sample_furniture("drawer", 100_003)
+    around = Around(observe(furniture, furniture.articulation.T_rest))
+    for _ in range(3):
+        still = np.eye(4)[None]
+        guard = GuardedRobot(robot, around, np.zeros((1, 3)), still, still, np.zeros(1, bool))
+        ik.seed_table(guard)
+        del guard
+        gc.collect()
+    assert len(made) == 1
 
 
 def test_says_so_when_there_is_no_plan(drawer: ActionModel, robot: Robot, platform: Platform) -> None:
