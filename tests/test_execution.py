@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import json
+from dataclasses import replace
 from functools import partial
 from weakref import WeakKeyDictionary
 
@@ -138,6 +139,28 @@ def test_plans_nothing_that_the_robot_cannot_do(drawer: ActionModel, robot: Robo
     wanted = furniture.articulation.pose(x[hold, -1]) @ plan.grasp
     assert np.linalg.norm(tool[:, :3, 3] - wanted[:, :3, 3], axis=1).max() < 0.01
     assert np.abs(v[[0, -1]]).max() < 1e-6
+
+
+def test_a_plan_ends_when_the_gripper_is_off_the_handle(robot: Robot, platform: Platform) -> None:
+    """What the teacher's hand did afterwards (here: went up to where no arm reaches) is not carried out, nor planned."""
+    motions = []
+    for seed in range(2):
+        motion = scenes.scripted_motion(sample_furniture("drawer", seed), np.random.default_rng(seed))
+        T = motion.T_world_tool.copy()
+        after = len(T) - motion.segments.release
+        T[-after:, 2, 3] += 2.0 * np.linspace(0, 1, after) ** 2
+        motions.append(replace(motion, T_world_tool=T))
+    model, furniture = learn(motions), sample_furniture("drawer", 100_003)
+    base, torso, q = np.array([-1.6, 0.3, 0.1]), 0.155, robot.description.posture
+    start = RobotPose(lie.se2_to_se3(base[None])[0] @ robot.forward(q[None], np.array([torso]))[0], base, torso)
+    observed = observe(furniture, furniture.articulation.T_rest)
+    whole = model.reproduce(observed.T_world_object, observed.articulation, None, 10.0, start)
+    assert whole.T_world_tool[-1, 2, 3] > 2.0 and len(whole.until(1e3)) == len(whole)
+    assert len(whole.until(0.0)) == whole.segments.release + 1
+    plan = make_plan(model, robot, platform, observed, start, q)
+    end = plan.timed.at(np.array([plan.release_s, plan.duration_s]))[0]
+    tool = lie.se2_to_se3(end[:, :3]) @ robot.forward(end[:, 4:-1], end[:, 3])
+    assert np.linalg.norm(tool[1, :3, 3] - tool[0, :3, 3]) == pytest.approx(0.1, abs=0.03)
 
 
 def test_tables_of_the_robot_are_made_once_however_often_it_is_guarded(
