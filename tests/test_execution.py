@@ -4,8 +4,14 @@ from __future__ import annotations
 
 import gc
 import json
+import os
+import signal
+import subprocess
+import sys
+import time
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -142,7 +148,7 @@ def test_plans_nothing_that_the_robot_cannot_do(drawer: ActionModel, robot: Robo
 
 
 def test_a_plan_ends_when_the_gripper_is_off_the_handle(robot: Robot, platform: Platform) -> None:
-    """What the teacher's hand did afterwards (here: went up to where no arm reaches) is not carried out, nor planned."""
+    """What the teacher's hand did afterwards (here: rose to where no arm reaches) is not carried out, nor planned."""
     motions = []
     for seed in range(2):
         motion = scenes.scripted_motion(sample_furniture("drawer", seed), np.random.default_rng(seed))
@@ -350,6 +356,26 @@ def test_trials_resume_and_refuse_foreign_results(
     other = Skill(scenes.scripted_skill("drawer", 1, 7), "drawer", "pr2")
     with pytest.raises(UnderstudyError, match="another skill"):
         trials.run_trials(other, robot, platform, layouts, tmp_path)
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="this system has no SIGKILL")
+def test_trials_that_were_killed_go_on(tmp_path) -> None:
+    """Killed in the midst of the second: the first is kept as it is, the second is whole, nothing else is left."""
+    first, second = (tmp_path / f"drawer-10200{i}.json" for i in (0, 1))
+    here = Path(__file__).resolve().parent
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(here), *sys.path])}
+    process = subprocess.Popen([sys.executable, here / "execution_scenes.py", tmp_path, "2"], env=environment)
+    deadline = time.monotonic() + 240
+    while not first.exists() and process.poll() is None:
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    time.sleep(0.3)
+    process.kill()
+    assert process.wait() == -signal.SIGKILL and not second.exists()
+    kept = first.stat().st_mtime_ns
+    rows = scenes.drawer_trials(tmp_path, 2)
+    assert first.stat().st_mtime_ns == kept and rows == [json.loads(p.read_text()) for p in (first, second)]
+    assert all(row["success"] for row in rows) and set(tmp_path.iterdir()) == {first, second}
 
 
 def test_bad_arguments_of_trials() -> None:
