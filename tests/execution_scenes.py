@@ -1,9 +1,15 @@
 """Skills for the tests of execution: the four tasks done by a geometric script, with exact truth of the furniture.
 
 They are demonstrations of how, not of where: nothing in them is feasible for the robot except by luck.
+
+As a program (`python execution_scenes.py OUT N`), it runs N trials with a drawer: for tests that kill it.
 """
 
 from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -65,3 +71,17 @@ def scripted_skill(task: str, demonstrations: int = 3, first_seed: int = 0) -> A
 
 def world_pose(base: np.ndarray) -> np.ndarray:
     return lie.se2_to_se3(base[None])[0]
+
+
+def drawer_trials(out: Path, n: int) -> list[dict[str, Any]]:
+    """n layouts with a drawer, in a folder."""
+    from understudy.actions import Skill
+    from understudy.adaptation.robots import platform_of
+    from understudy.execution import trials
+
+    robot, skill = trials.trial_robot("pr2"), Skill(scripted_skill("drawer"), "drawer", "pr2")
+    return trials.run_trials(skill, robot, platform_of(robot), trials.setups("drawer", n, 2), out)
+
+
+if __name__ == "__main__":
+    drawer_trials(Path(sys.argv[1]), int(sys.argv[2]))

@@ -1,15 +1,18 @@
 """Teaching without cameras: demonstrations of a drawer that are made up instead of estimated.
 
-As a program (`python teaching_scenes.py OUT`), it teaches from one of them: for tests that kill it.
+As a program (`python teaching_scenes.py OUT`), it teaches from one of them and tries the skill once, resting at the end
+of the first stage and at the start of the last: for tests that kill it.
 """
 
 from __future__ import annotations
 
 import sys
+import time
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 from unittest.mock import patch
 
 import adaptation_scenes as scenes
@@ -41,17 +44,31 @@ def made_up(paths: Sequence[str | Path], out: Path, *args: object, **options: ob
 
 
 def taught(
-    out: Path, names: Sequence[str] = ("one",), task: str = "drawer", trials: int = 0, drawn: bool = False
+    out: Path,
+    names: Sequence[str] = ("one",),
+    task: str = "drawer",
+    trials: int = 0,
+    drawn: bool = False,
+    rest_s: float = 0.0,
 ) -> Teaching:
-    """`teach` with made-up demonstrations. drawn: with pictures; without them, the report is a line."""
+    """`teach` with made-up demonstrations. drawn: with pictures; without them, the report is a line.
+
+    rest_s: after the demonstrations were saved, and before the report is.
+    """
 
     def line(teaching: Teaching) -> Path:
+        time.sleep(rest_s)
         write_atomically(teaching.report, "a line")
         return teaching.report
 
+    def resting(*args: Any, **options: Any) -> list[Result]:
+        results = made_up(*args, **options)
+        time.sleep(rest_s)
+        return results
+
     config = TeachConfig(trials=trials, film=False)
     with ExitStack() as stack:
-        stack.enter_context(patch.object(teaching, "demonstrate", made_up))
+        stack.enter_context(patch.object(teaching, "demonstrate", resting))
         if not drawn:
             stack.enter_context(patch.object(report, "write", line))
             stack.enter_context(patch.object(plots, "pictures", lambda *args: {}))
@@ -75,4 +92,4 @@ def as_if_adapted(demonstrations: Sequence[Demonstration]) -> AdaptationResult:
 
 
 if __name__ == "__main__":
-    taught(Path(sys.argv[1]))
+    taught(Path(sys.argv[1]), trials=1, rest_s=5.0)

@@ -2,8 +2,17 @@
 
 from __future__ import annotations
 
+import gc
 import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
 from functools import partial
+from pathlib import Path
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import pytest
@@ -23,6 +32,7 @@ from understudy.adaptation.platform import Platform  # noqa: E402
 from understudy.demonstration.demonstration import OCCUPIED  # noqa: E402
 from understudy.errors import MissingExtraError, UnderstudyError  # noqa: E402
 from understudy.execution import trials  # noqa: E402
+from understudy.execution.clearance import Around, GuardedRobot  # noqa: E402
 from understudy.execution.control import Arm, HandleEstimate  # noqa: E402
 from understudy.execution.execution import Config, Execution  # noqa: E402
 from understudy.execution.imitation import imitation_plan, unadapted  # noqa: E402
@@ -31,6 +41,7 @@ from understudy.execution.planning import make_plan  # noqa: E402
 from understudy.execution.surroundings import observe  # noqa: E402
 from understudy.execution.timing import time_scaled  # noqa: E402
 from understudy.geometry import inverse  # noqa: E402
+from understudy.robot import ik  # noqa: E402
 from understudy.robot.model import Robot  # noqa: E402
 from understudy.robot.simulator import Noise, Simulator  # noqa: E402
 from understudy.stage.furniture import sample_furniture  # noqa: E402
@@ -134,6 +145,50 @@ def test_plans_nothing_that_the_robot_cannot_do(drawer: ActionModel, robot: Robo
     wanted = furniture.articulation.pose(x[hold, -1]) @ plan.grasp
     assert np.linalg.norm(tool[:, :3, 3] - wanted[:, :3, 3], axis=1).max() < 0.01
     assert np.abs(v[[0, -1]]).max() < 1e-6
+
+
+def test_a_plan_ends_when_the_gripper_is_off_the_handle(robot: Robot, platform: Platform) -> None:
+    """What the teacher's hand did afterwards (here: rose to where no arm reaches) is not carried out, nor planned."""
+    motions = []
+    for seed in range(2):
+        motion = scenes.scripted_motion(sample_furniture("drawer", seed), np.random.default_rng(seed))
+        T = motion.T_world_tool.copy()
+        after = len(T) - motion.segments.release
+        T[-after:, 2, 3] += 2.0 * np.linspace(0, 1, after) ** 2
+        motions.append(replace(motion, T_world_tool=T))
+    model, furniture = learn(motions), sample_furniture("drawer", 100_003)
+    base, torso, q = np.array([-1.6, 0.3, 0.1]), 0.155, robot.description.posture
+    start = RobotPose(lie.se2_to_se3(base[None])[0] @ robot.forward(q[None], np.array([torso]))[0], base, torso)
+    observed = observe(furniture, furniture.articulation.T_rest)
+    whole = model.reproduce(observed.T_world_object, observed.articulation, None, 10.0, start)
+    assert whole.T_world_tool[-1, 2, 3] > 2.0 and len(whole.until(1e3)) == len(whole)
+    assert len(whole.until(0.0)) == whole.segments.release + 1
+    plan = make_plan(model, robot, platform, observed, start, q)
+    end = plan.timed.at(np.array([plan.release_s, plan.duration_s]))[0]
+    tool = lie.se2_to_se3(end[:, :3]) @ robot.forward(end[:, 4:-1], end[:, 3])
+    assert np.linalg.norm(tool[1, :3, 3] - tool[0, :3, 3]) == pytest.approx(0.1, abs=0.03)
+
+
+def test_tables_of_the_robot_are_made_once_however_often_it_is_guarded(
+    robot: Robot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made, init = [], ik.SeedTable.__init__
+
+    def counted(self: ik.SeedTable, robot: Robot) -> None:
+        made.append(robot)
+        init(self, robot, 100)
+
+    monkeypatch.setattr(ik, "_tables", WeakKeyDictionary())
+    monkeypatch.setattr(ik.SeedTable, "__init__", counted)
+    furniture = sample_furniture("drawer", 100_003)
+    around = Around(observe(furniture, furniture.articulation.T_rest))
+    for _ in range(3):
+        still = np.eye(4)[None]
+        guard = GuardedRobot(robot, around, np.zeros((1, 3)), still, still, np.zeros(1, bool))
+        ik.seed_table(guard)
+        del guard
+        gc.collect()
+    assert len(made) == 1
 
 
 def test_says_so_when_there_is_no_plan(drawer: ActionModel, robot: Robot, platform: Platform) -> None:
@@ -301,6 +356,26 @@ def test_trials_resume_and_refuse_foreign_results(
     other = Skill(scenes.scripted_skill("drawer", 1, 7), "drawer", "pr2")
     with pytest.raises(UnderstudyError, match="another skill"):
         trials.run_trials(other, robot, platform, layouts, tmp_path)
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="this system has no SIGKILL")
+def test_trials_that_were_killed_go_on(tmp_path) -> None:
+    """Killed in the midst of the second: the first is kept as it is, the second is whole, nothing else is left."""
+    first, second = (tmp_path / f"drawer-10200{i}.json" for i in (0, 1))
+    here = Path(__file__).resolve().parent
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(here), *sys.path])}
+    process = subprocess.Popen([sys.executable, here / "execution_scenes.py", tmp_path, "2"], env=environment)
+    deadline = time.monotonic() + 240
+    while not first.exists() and process.poll() is None:
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    time.sleep(0.3)
+    process.kill()
+    assert process.wait() == -signal.SIGKILL and not second.exists()
+    kept = first.stat().st_mtime_ns
+    rows = scenes.drawer_trials(tmp_path, 2)
+    assert first.stat().st_mtime_ns == kept and rows == [json.loads(p.read_text()) for p in (first, second)]
+    assert all(row["success"] for row in rows) and set(tmp_path.iterdir()) == {first, second}
 
 
 def test_bad_arguments_of_trials() -> None:

@@ -172,6 +172,23 @@ def test_the_arm_in_the_body_collides_and_the_comfortable_posture_does_not(robot
     assert not robot.self_collision.touching(posture, low)
 
 
+def test_balls_rule_out_no_pair_of_links_that_touches(robot: Robot) -> None:
+    """They rule out nearly all that do not; what remains is exactly Coal's answer over all pairs."""
+    collision = robot.self_collision
+    q, torso = robot.sample(600, seed=12)
+    near = collision.near(q, torso)
+    touching = np.zeros_like(near)
+    for i, row in enumerate(collision.configurations(q, torso)):
+        pin.updateGeometryPlacements(
+            collision.model, collision.data, collision.geometry, collision.geometry_data, row
+        )  # fmt: skip
+        pin.computeCollisions(collision.geometry, collision.geometry_data, False)
+        touching[i] = [r.isCollision() for r in collision.geometry_data.collisionResults]
+    assert touching.any() and not (touching & ~near).any()
+    assert near.mean() < 0.15
+    np.testing.assert_array_equal(robot.collides(q, torso), touching.any(axis=1))
+
+
 # inverse kinematics
 
 

@@ -193,26 +193,41 @@ def test_a_robot_is_taught(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="this system has no SIGKILL")
 def test_killed_and_started_again(tmp_path: Path) -> None:
-    """The same files as of a run that nobody disturbed, and nothing half-written left."""
-    teaching_scenes.taught(tmp_path / "whole")
-    out, stages = tmp_path / "killed", tmp_path / "killed/stages.json"
+    """In every stage, one after the other. The same files as of a run that nobody disturbed, none half-written."""
+    whole = teaching_scenes.taught(tmp_path / "whole", trials=1)
+    out = tmp_path / "killed"
     here = Path(__file__).resolve().parent
     environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(here), *sys.path])}
-    for stage in ('"adapt"', '"learn"'):
+    times = dict[str, int]()
+    for stage in ("demonstrate", "adapt", "learn", "trial 000", "report"):
         process = subprocess.Popen([sys.executable, here / "teaching_scenes.py", out], env=environment)
-        deadline = time.monotonic() + 60
-        while not (stages.exists() and stage in stages.read_text()) and process.poll() is None:
-            assert time.monotonic() < deadline
+        deadline = time.monotonic() + 120
+        while not _is_in(out, stage) and process.poll() is None:
+            assert time.monotonic() < deadline, stage
             time.sleep(0.002)
         process.kill()
-        assert process.wait() == -signal.SIGKILL
+        assert process.wait() == -signal.SIGKILL, stage
         assert not (out / "report.html").exists()
-    result = teaching_scenes.taught(out)
-    assert result.timings["learn"].resumed
-    for name in WHOLE:
+        done = {str(p): p.stat().st_mtime_ns for p in map(out.__truediv__, WHOLE) if p.exists()}
+        assert done.items() >= times.items()  # what was finished is not made again
+        times = done if stage in ("trial 000", "report") else {}  # before, what is there may be half of a stage
+    result = teaching_scenes.taught(out, trials=1)
+    assert result.timings["learn"].resumed and result.timings["trial 000"].resumed
+    assert [replace(t, folder=out) for t in result.outcomes] == [replace(t, folder=out) for t in whole.outcomes]
+    for name in (*WHOLE, "trials/000/trial.json"):
         assert (out / name).read_bytes() == (tmp_path / "whole" / name).read_bytes(), name
     files = {p.relative_to(out) for p in out.rglob("*") if not p.name.startswith(".")}
     assert files == {p.relative_to(tmp_path / "whole") for p in (tmp_path / "whole").rglob("*")}
+
+
+def _is_in(out: Path, stage: str) -> bool:
+    """Whether a run has begun that stage and not finished it, by its own book."""
+    if not (out / "stages.json").exists():
+        return False
+    entries = json.loads((out / "stages.json").read_text())["stages"]
+    if stage == "report":  # in no book: it is made each time, when all others are done
+        return bool(entries.get("trial 000", {}).get("finished"))
+    return stage in entries and not entries[stage]["finished"]
 
 
 def test_what_the_robot_cannot_do_is_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from itertools import pairwise
 from typing import TYPE_CHECKING, Final
 
@@ -53,6 +53,12 @@ class Reproduction:
 
     def __len__(self) -> int:
         return len(self.times_s)
+
+    def until(self, time_s: float) -> Reproduction:
+        """Its beginning; nothing before the gripper opens is left out."""
+        n = max(int(np.searchsorted(self.times_s, time_s + 1e-9, side="right")), self.segments.release + 1)
+        tracks = {f.name: getattr(self, f.name)[:n] for f in fields(self) if f.name != "segments"}
+        return replace(self, **tracks)
 
 
 def reproduce(model: ActionModel, thing: ObjectMotion, rate_hz: float, start: RobotPose | None) -> Reproduction:

@@ -16,7 +16,7 @@ from understudy import lie
 from understudy.adaptation.fields import DistanceField, point_field
 from understudy.execution.surroundings import Observed
 from understudy.robot.arm_surface import arm_surface
-from understudy.robot.ik import embed
+from understudy.robot.ik import embed, seed_table
 from understudy.robot.model import Robot
 
 _CELL_M: Final = 0.025
@@ -55,6 +55,7 @@ class GuardedRobot(Robot):
         """guarded: samples at which the arm must be clear. spare_m: of the links' surfaces to a cell in which something
         is; to that itself, it is half a cell more.
         """
+        seed_table(robot)  # asked for first by a robot that is soon forgotten, it would be made anew each time
         self.__dict__.update(robot.__dict__)  # the same model, limits and description: nothing is read anew
         self._robot, self._around, self._guarded, self._spare = robot, around, guarded, spare_m
         self._T_world_base = lie.se2_to_se3(base)

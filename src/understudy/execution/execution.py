@@ -250,7 +250,7 @@ class _Run:
         self.T_given = T_given
 
     def release(self, plan: Plan) -> None:
-        """Opens the fingers, goes straight back, then as the skill does."""
+        """Opens the fingers and goes straight back off the handle: done."""
         self.share = self.opened_share()
         self.released = True
         widest = self.widest

@@ -94,6 +94,7 @@ def make_plan(
     began = time.process_time()
     try:
         motion = model.reproduce(observed.T_world_object, observed.articulation, q_goal, RATE_HZ, start)
+        motion = motion.until(float(motion.times_s[motion.segments.release]) + APPROACH_S)  # done when off the handle
         task = _as_demonstration(motion, observed)
         graph, state, path = _first_solved(task, motion, robot, platform, observed, start)
     except Stopped:

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from jaxtyping import Bool, Float
 
+from understudy.robot.chain import frames
+from understudy.robot.collision_cover import Cover, covered
 from understudy.robot.description import RobotError
 from understudy.robot.model import require_pinocchio
 from understudy.robot.urdf import source_path
@@ -47,19 +49,25 @@ class SelfCollision:
             self._drop_touching(robot)
         self._simplify()
         self.geometry_data = self.geometry.createData()
+        self._cover = self._covered(robot)
         if self.check(d.posture[None], np.array([robot.torso_limits[0]]))[0]:
             raise RobotError(f"{d.where}: posture: the arm touches {self.touching(d.posture, robot.torso_limits[0])}")
 
     def check(self, q: Float[np.ndarray, "n j"], torso: Float[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
         """Whether any pair touches, for each configuration."""
-        rows = self.configurations(q, torso)
-        update, touch = self._pin.updateGeometryPlacements, self._pin.computeCollisions
-        out = np.empty(len(rows), bool)
+        rows, near = self.configurations(q, torso), self.near(q, torso)
+        update, touch = self._pin.updateGeometryPlacements, self._pin.computeCollision
+        out = np.zeros(len(rows), bool)
         with self._lock:  # one set of working data for all threads
-            for i, row in enumerate(rows):
-                update(self.model, self.data, self.geometry, self.geometry_data, row)
-                out[i] = touch(self.geometry, self.geometry_data, True)
+            for i in np.flatnonzero(near.any(axis=1)):
+                update(self.model, self.data, self.geometry, self.geometry_data, rows[i])
+                pairs = np.flatnonzero(near[i]).tolist()
+                out[i] = any(touch(self.geometry, self.geometry_data, pair) for pair in pairs)
         return out
+
+    def near(self, q: Float[np.ndarray, "n j"], torso: Float[np.ndarray, " n"]) -> Bool[np.ndarray, "n p"]:
+        """Pairs of shapes that may touch; the others cannot."""
+        return self._cover.near(self._fixed, np.column_stack([torso, q]))
 
     def touching(self, q: Float[np.ndarray, " j"], torso: float) -> list[tuple[str, str]]:
         """The pairs of links that touch."""
@@ -112,6 +120,28 @@ class SelfCollision:
             small = 2 * mesh.aabb_radius <= _HULL_SIZE
             if hull is not None and (small or hull.computeVolume() <= (1 + _HULL_EXCESS) * solid):
                 shape.geometry = hull
+
+    def _covered(self, robot: Robot) -> Cover:
+        """Balls around all shapes, in the frames of the chain's joints."""
+        d, torso = robot.description, robot.torso_limits[0]
+        self._fixed = robot.fixed
+        x = robot.stack(d.posture[None], np.array([torso]))[0]
+        work, tmp = np.empty((len(x) + 1, 3, 4)), np.empty((3, 4))
+        frames(robot.fixed, x, work, tmp)
+        self._pin.forwardKinematics(self.model, self.data, self.configurations(d.posture[None], np.array([torso]))[0])
+        numbers = {name: k for k, name in enumerate([d.torso_joint, *d.arm_joints]) if name is not None}
+        shapes, joints = [], []
+        for shape in self.geometry.geometryObjects:
+            points, spare = covered(shape.geometry)
+            T = (self.data.oMi[shape.parentJoint] * shape.placement).homogeneous
+            points = points @ T[:3, :3].T + T[:3, 3]
+            joint = numbers.get(self.model.names[shape.parentJoint], -1)
+            if joint >= 0:
+                points = (points - work[joint, :, 3]) @ work[joint, :, :3]
+            shapes.append((points, spare))
+            joints.append(joint)
+        pairs = np.array([(p.first, p.second) for p in self.geometry.collisionPairs], int).reshape(-1, 2)
+        return Cover(shapes, np.array(joints, int), pairs)
 
     def _keep(self, wanted: list[bool]) -> None:
         """Keeps those pairs, and the shapes that are in any: placing the others costs time."""

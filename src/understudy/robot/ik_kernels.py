@@ -232,6 +232,24 @@ def solve_from_seeds(  # type: ignore[no-untyped-def]
 
 
 @compiled
+def distinct(x, apart):  # type: ignore[no-untyped-def]
+    """Rows of x (m, n) that differ from each kept row before by more than `apart` in some column: a mask (m)."""
+    m, n = x.shape
+    keep = np.ones(m, np.bool_)
+    for i in range(m):
+        for o in range(i):
+            if not keep[o]:
+                continue
+            most = 0.0
+            for j in range(n):
+                most = max(most, abs(x[i, j] - x[o, j]))
+            if not most > apart:
+                keep[i] = False
+                break
+    return keep
+
+
+@compiled
 def follow_branches(fixed, starts, first, lower, upper, targets, L, limits):  # type: ignore[no-untyped-def]
     """Solutions followed from sample to sample, each by the smallest motion, to both ends of a trajectory.
 

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 
 from understudy.errors import UnderstudyError
 from understudy.robot.ik import LENGTH, IKProblem, pose_distance
-from understudy.robot.ik_kernels import solve_from_seeds
+from understudy.robot.ik_kernels import distinct, solve_from_seeds
 from understudy.robot.model import Robot
 
 _POSTURE_WEIGHT: Final = 1e-3
@@ -91,11 +91,7 @@ def _follow(problem: IKProblem, i: int, before: Float[np.ndarray, "s k"]) -> Flo
 
 def _distinct(layer: Float[np.ndarray, "s k"]) -> Float[np.ndarray, "m k"]:
     """Without those that lie within 0.02 of an earlier one."""
-    kept: list[np.ndarray] = []
-    for x in layer:
-        if all(np.abs(x - other).max() > 0.02 for other in kept):
-            kept.append(x)
-    return np.array(kept).reshape(len(kept), layer.shape[1])
+    return np.asarray(layer[distinct(np.ascontiguousarray(layer), 0.02)])
 
 
 def _steps(problem: IKProblem, a: Float[np.ndarray, "s k"], b: Float[np.ndarray, "m k"]) -> Float[np.ndarray, "s m k"]:
