@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float
 
 from understudy import lie
 from understudy.adaptation import prepare
+from understudy.adaptation.around import Surrounded
 from understudy.adaptation.calibration import Calibration
 from understudy.adaptation.clock import Motion, arm_motion, base_motion, gripper_motion, joined, retimed
 from understudy.adaptation.errors import InfeasibleError
@@ -128,7 +129,9 @@ class _Adaptation:
     def __init__(self, demonstrations: tuple[Demonstration, ...], platform: Platform, config: AdaptConfig):
         self.demonstrations, self.platform, self.config = demonstrations, platform, config
         self.obstacles = prepare.Obstacles(demonstrations)
-        self.panels = [panel_path(d, object_path(d)) for d in demonstrations]
+        self.arounds = prepare.arounds(demonstrations, self.obstacles)
+        self.objects = [object_path(d) for d in demonstrations]
+        self.panels = [panel_path(d, T) for d, T in zip(demonstrations, self.objects, strict=True)]
         self.notes: list[str] = []
         self.slower = np.ones(len(demonstrations))
 
@@ -209,7 +212,7 @@ class _Adaptation:
             for panel, (s, _) in zip(self.panels, self.each(), strict=True)
         ]
         seen = lie.se3_inverse(lie.se2_to_se3(state.base)) @ state.gripper
-        joints = tuple(self.joints(seen[s], state.torso[s], d.times_s) for s, d in self.each())
+        joints = tuple(self.joints(state, number) for number in range(len(self.demonstrations)))
         achieved = np.concatenate(
             [np.zeros(len(d), bool) if j is None else j.exact for j, d in zip(joints, self.demonstrations, strict=True)]
         )
@@ -218,12 +221,15 @@ class _Adaptation:
             achieved[rest] = self.platform.achievable(seen[rest], state.torso[rest])
         return _Checked(state, np.concatenate(free), np.concatenate(beside), achieved, joints)
 
-    def joints(
-        self, T: Float[np.ndarray, "t 4 4"], torso: Float[np.ndarray, " t"], times_s: np.ndarray, thorough: bool = False
-    ) -> JointPath | None:
-        """Of the arm, along one demonstration (base frame)."""
-        arm = self.platform.arm
-        return None if arm is None else arm.path(T, torso, times_s, thorough=thorough)
+    def joints(self, state: State, number: int, thorough: bool = False) -> JointPath | None:
+        """Of the arm, along one demonstration."""
+        arm, (s, d) = self.platform.arm, self.each()[number]
+        if arm is None:
+            return None
+        base = state.base[s]
+        surrounded = Surrounded(self.arounds[number], base, self.objects[number])
+        seen = lie.se3_inverse(lie.se2_to_se3(base)) @ state.gripper[s]
+        return arm.path(seen, state.torso[s], d.times_s, surrounded=surrounded, thorough=thorough)
 
     def each(self) -> list[tuple[slice, Demonstration]]:
         """Demonstrations with their steps in the chain."""
@@ -235,11 +241,10 @@ class _Adaptation:
         """The result of each demonstration, and notes about clocks and joints."""
         state, problem = found.state, graph.problem
         energies = energies_over_time(graph, state, self.config.schedule[-1])
-        seen = lie.se3_inverse(lie.se2_to_se3(state.base)) @ state.gripper
         out = []
-        for (s, d), slower, joints in zip(self.each(), self.slower, found.joints, strict=True):
-            if joints is not None and not joints.linked.all():
-                joints = self.joints(seen[s], state.torso[s], d.times_s, thorough=True)
+        for number, ((s, d), slower, joints) in enumerate(zip(self.each(), self.slower, found.joints, strict=True)):
+            if joints is not None and not (joints.linked.all() and joints.clear.all()):
+                joints = self.joints(state, number, thorough=True)
             times = d.times_s[0] + slower * (d.times_s - d.times_s[0])
             if self.config.slow_down:
                 times = retimed(self.motion(state, s, joints), times, _SLOWEST)
