@@ -14,6 +14,7 @@ from understudy import lie
 from understudy.adaptation import prepare
 from understudy.adaptation.around import Surrounded
 from understudy.adaptation.calibration import Calibration
+from understudy.adaptation.checks import Checked, about_arm
 from understudy.adaptation.clock import Motion, arm_motion, base_motion, gripper_motion, joined, retimed
 from understudy.adaptation.errors import InfeasibleError
 from understudy.adaptation.explain import conflicts, energies_over_time
@@ -98,31 +99,6 @@ def _check(demonstrations: Sequence[Demonstration]) -> None:
             raise UnderstudyError(f"adapt: demonstration {i}: the hand never takes hold (segments.grasp at the end)")
 
 
-@dataclass(frozen=True, eq=False)
-class _Checked:
-    """A state, and what the exact checks say about it."""
-
-    state: State
-    free: Bool[np.ndarray, " n"]
-    """exactly clear of each demonstration's map"""
-    beside: Bool[np.ndarray, " n"]
-    """the base is not where the moving part is"""
-    achieved: Bool[np.ndarray, " n"]
-    """by exact inverse kinematics"""
-    joints: tuple[JointPath | None, ...]
-    """per demonstration"""
-
-    @property
-    def clear(self) -> Bool[np.ndarray, " n"]:
-        """The base hits nothing."""
-        return self.free & self.beside
-
-    @property
-    def failures(self) -> tuple[int, int]:
-        """Samples at which something fails that must not; and at which the base is where the part is."""
-        return int((~(self.free & self.achieved)).sum()), int((~self.beside).sum())
-
-
 class _Adaptation:
     """One call of `adapt`."""
 
@@ -171,20 +147,20 @@ class _Adaptation:
         """Values of demonstrations for each step of the chain."""
         return np.repeat(values, [len(d) for d in self.demonstrations])
 
-    def tighten(self, graph: Graph, state: State, converged: bool) -> tuple[_Checked, int, list[Iteration], bool]:
+    def tighten(self, graph: Graph, state: State, converged: bool) -> tuple[Checked, int, list[Iteration], bool]:
         """Larger margins where exact checks fail, the last stage again, until nothing fails; or the best of all."""
         course: list[Iteration] = []
-        stage, every = self.config.schedule[-1], list[tuple[_Checked, Problem, np.ndarray]]()
+        stage, every = self.config.schedule[-1], list[tuple[Checked, Problem, np.ndarray]]()
         for round in range(self.config.rounds):
             found = self.checked(state)
             late = self.late(graph, found)
             every.append((found, graph.problem, self.slower))
-            good = found.clear.all() and found.achieved.mean() >= self.config.target_achievable
+            good = found.clear.all() and found.achieved.mean() >= self.config.target_achievable and found.arm.all()
             if good and (late == 1).all():
                 return found, round, course, converged
             self.slower = self.slower * late
             graph.stretch(self.per_step(late))
-            graph.reach_margin[_widened(~found.achieved)] += _REACH_STEP
+            graph.reach_margin[_widened(~(found.achieved & found.arm))] += _REACH_STEP  # an arm with room has choices
             graph.map_stiffness[_widened(~found.free)] *= _STIFFER
             graph.part_stiffness[_widened(~found.beside)] *= _STIFFER
             if not found.free.all() and graph.obstacle_margin < self.config.margins.obstacle + _MOST_OBSTACLE:
@@ -195,7 +171,7 @@ class _Adaptation:
         found, graph.problem, self.slower = min(every, key=lambda one: one[0].failures)
         return found, self.config.rounds, course, converged
 
-    def late(self, graph: Graph, found: _Checked) -> Float[np.ndarray, " d"]:
+    def late(self, graph: Graph, found: Checked) -> Float[np.ndarray, " d"]:
         """By how much to slow down further: 1 where no grasp is missed and nothing is hit for lack of time."""
         over = graph.excess(found.state)
         failed = np.array([not found.clear[s].all() for s, _ in self.each()])
@@ -203,7 +179,7 @@ class _Adaptation:
         factor = np.minimum(np.clip(over, *_SLOWER), _SLOWEST / self.slower)
         return np.where(failed & (over > _NEARLY) & self.config.slow_down, np.maximum(factor, 1.0), 1.0)
 
-    def checked(self, state: State) -> _Checked:
+    def checked(self, state: State) -> Checked:
         """Exact checks. A joint path proves what it goes through; only the rest is left to inverse kinematics."""
         state = replace(state, torso=np.clip(state.torso, *self.platform.torso_limits))  # to the last digit
         free = [collision_free(d.map, self.platform.footprint, state.base[s]) for s, d in self.each()]
@@ -219,7 +195,8 @@ class _Adaptation:
         rest = np.flatnonzero(~achieved)
         if len(rest):
             achieved[rest] = self.platform.achievable(seen[rest], state.torso[rest])
-        return _Checked(state, np.concatenate(free), np.concatenate(beside), achieved, joints)
+        sizes = tuple(len(d) for d in self.demonstrations)
+        return Checked(state, np.concatenate(free), np.concatenate(beside), achieved, joints, sizes)
 
     def joints(self, state: State, number: int, thorough: bool = False) -> JointPath | None:
         """Of the arm, along one demonstration."""
@@ -237,7 +214,7 @@ class _Adaptation:
         steps = [slice(int(a), int(b)) for a, b in pairwise(ends)]
         return list(zip(steps, self.demonstrations, strict=True))
 
-    def parts(self, graph: Graph, found: _Checked) -> tuple[Adapted, ...]:
+    def parts(self, graph: Graph, found: Checked) -> tuple[Adapted, ...]:
         """The result of each demonstration, and notes about clocks and joints."""
         state, problem = found.state, graph.problem
         energies = energies_over_time(graph, state, self.config.schedule[-1])
@@ -275,14 +252,13 @@ class _Adaptation:
         over = 0.0
         for i, ((s, _), a) in enumerate(zip(self.each(), adapted, strict=True)):
             over = max(over, *(x.max(initial=0.0) for x in self.motion(state, s, a.joints).shares(np.diff(a.times_s))))
-            if a.joints is not None and not a.joints.linked.all():
-                at = ", ".join(map(str, np.flatnonzero(~a.joints.linked).tolist()[:6]))
+            if a.joints is not None:
                 which = f"demonstration {i}: " if several else ""
-                self.notes.append(f"{which}no continuous motion of the arm was found after samples {at}")
+                self.notes += [which + words for words in about_arm(a.joints)]
         if over > 1:
             self.notes.append(f"up to {over:.2f} times as fast as {name} can go")
 
-    def refuse(self, graph: Graph, found: _Checked) -> None:
+    def refuse(self, graph: Graph, found: Checked) -> None:
         """Raises InfeasibleError for a result that the robot cannot do; notes what it can nearly do."""
         clear, achieved = found.free, found.achieved
         off, turned = graph.missed(found.state).max(axis=0)

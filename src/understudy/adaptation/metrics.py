@@ -251,8 +251,8 @@ def _within(motion: Motion, dt: Float[np.ndarray, " n"]) -> Bool[np.ndarray, " n
 
 
 def _arm(paths: Sequence[_Path], robot: Platform) -> list[float]:
-    """Shares of samples at which the arm is clear of scene and part, greatest share of a joint's velocity limit, and the
-    share of steps within all limits of joints.
+    """Shares of samples at which the arm is clear of scene and of part, greatest share of a joint's velocity limit, and
+    the share of steps within all limits of joints.
     """
     fastest, within, clear = [0.0], [], []
     for path in paths:

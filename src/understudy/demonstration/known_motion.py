@@ -70,4 +70,4 @@ def _beside(still: Float[np.ndarray, "m 3"], places: Float[np.ndarray, "n k 3"])
     if not len(still):
         return np.zeros(places.shape[:2], bool)
     away = cKDTree(still).query(places.reshape(-1, 3), distance_upper_bound=VOXEL)[0]
-    return np.asarray((away < VOXEL).reshape(places.shape[:2]))
+    return np.asarray(away < VOXEL).reshape(places.shape[:2])

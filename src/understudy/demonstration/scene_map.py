@@ -19,8 +19,8 @@ from understudy.voxels import cloud
 
 VOXEL: Final = 0.04
 """metres"""
-RESOLUTION: Final = 0.05
-"""metres: edge of a cell of the map"""
+RESOLUTION: Final = 0.03
+"""metres: edge of a cell of the map; doorways are but a hand's breadth wider than a robot"""
 HEIGHTS: Final = (0.10, 1.60)
 """metres above the floor: what a base (and what stands on it) can bump into"""
 
@@ -34,6 +34,7 @@ _STAYS = 0.75  # least share of the looks at a place that found something
 _COMPANY = 2  # neighbours that a voxel needs
 _PART = 0.06  # metres around the moving part
 _RAYS, _LOW = 3000, 0.5  # rays of a frame that clear the way; below this height, metres
+_STEP = 0.05  # metres along a ray, at the farthest
 _WALKED = 0.20  # metres around where the person walked
 
 
@@ -75,7 +76,7 @@ class Votes:
     """What k looks say about n voxels of a frame: a look in which something nearer hid a voxel says nothing."""
 
     center: Float[np.ndarray, "n 3"]
-    """metres"""
+    """middles of what was measured in them, metres"""
     hit: Bool[np.ndarray, "n k"]
     """the look found a surface there"""
     through: Bool[np.ndarray, "n k"]
@@ -99,14 +100,19 @@ def votes(views: Sequence[View], T_frame_cam: Float[np.ndarray, "k 4 4"]) -> Vot
         transform_points(T, _without_people(view).astype(np.float64))
         for view, T in zip(views, T_frame_cam, strict=True)
     ]
-    keys = [np.unique(np.floor(c / VOXEL).astype(np.int32), axis=0) for c in clouds]
-    if not keys or not sum(map(len, keys)):
+    points = np.concatenate([np.zeros((0, 3)), *clouds])
+    look = np.repeat(np.arange(len(views)), [len(c) for c in clouds])
+    if not len(points):
         none = np.zeros((0, len(views)), bool)
-        return Votes(np.zeros((0, 3)), none, none)
-    voxel, which = np.unique(np.concatenate(keys), axis=0, return_inverse=True)
-    center = (voxel + 0.5) * VOXEL
-    hit = np.zeros((len(voxel), len(views)), bool)
-    hit[which.ravel(), np.repeat(np.arange(len(views)), [len(k) for k in keys])] = True
+        return Votes(points, none, none)
+    cell = np.floor(points / VOXEL).astype(np.int64)
+    cell -= cell.min(axis=0)
+    _, which, count = np.unique(
+        np.ravel_multi_index(tuple(cell.T), tuple(cell.max(axis=0) + 1)), return_inverse=True, return_counts=True
+    )
+    center = np.column_stack([np.bincount(which, axis) for axis in points.T]) / count[:, None]
+    hit = np.zeros((len(center), len(views)), bool)
+    hit[which, look] = True
     through = [
         _seen_through(view.depth, transform_points(inverse(T), center))
         for view, T in zip(views, T_frame_cam, strict=True)
@@ -158,11 +164,15 @@ def occupancy(
     low = np.floor(everything.min(axis=0) / RESOLUTION) - 2
     size = np.ceil(everything.max(axis=0) / RESOLUTION) + 3 - low
     state = np.full((int(size[1]), int(size[0])), UNKNOWN, np.uint8)
-    for points in (open_floor, *rays):
-        _mark(state, points[:, :2], low, FREE)
+    square = np.stack(np.meshgrid(*[(-VOXEL / 2, 0.0, VOXEL / 2)] * 2), axis=-1).reshape(-1, 2)
+    for points in (open_floor, *rays):  # each stands for a voxel; what is occupied is known better
+        _mark(state, (points[:, None, :2] + square).reshape(-1, 2), low, FREE)
     disc = _disc(_WALKED)
     _mark(state, (ways[:, None] + disc).reshape(-1, 2), low, FREE)
-    _mark(state, solid[:, :2], low, OCCUPIED)
+    taken = np.zeros_like(state)
+    _mark(taken, solid[:, :2], low, 1)
+    # voxels are larger than cells: what is between neighbours is closed, the outline stays
+    state[cv2.morphologyEx(taken, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8)) > 0] = OCCUPIED
     return OccupancyMap(state, low * RESOLUTION, RESOLUTION)
 
 
@@ -219,7 +229,7 @@ def _low_points(view: View, T_world_cam: Float[np.ndarray, "4 4"]) -> Float[np.n
     points = _without_people(view)
     points = points[:: max(1, len(points) // _RAYS)].astype(np.float64)
     end, start = transform_points(T_world_cam, points), T_world_cam[:3, 3]
-    steps = max(2, int(np.ceil(_FARTHEST / RESOLUTION)))
+    steps = max(2, int(np.ceil(_FARTHEST / _STEP)))
     share = (np.arange(steps) + 0.5) / steps * 0.98  # not into what the ray met
     drop = start[2] - end[:, 2]
     from_share = np.where(drop > 1e-6, (start[2] - _LOW) / np.maximum(drop, 1e-6), 2.0)  # where the ray gets so low
