@@ -15,6 +15,7 @@ import pytest
 from understudy import lie
 from understudy.adaptation import calibration, edges, grasps, metrics, most, placement, plots, prepare, storage
 from understudy.adaptation.adapt import AdaptConfig, adapt
+from understudy.adaptation.around import Surrounded
 from understudy.adaptation.calibration import DEFAULT_HAND_TOOL, DEFAULT_TORSO_BASE, Calibration
 from understudy.adaptation.clock import Motion, retimed
 from understudy.adaptation.errors import InfeasibleError
@@ -209,11 +210,13 @@ def test_a_teacher_who_is_too_fast_is_slowed_down() -> None:
 def _with_arm(velocity: float, acceleration: float, broken: int | None = None) -> Platform:
     """A platform whose arm is read off the gripper: two joints that go as it does, east and up, and turn with it."""
 
-    def path(T: np.ndarray, torso: np.ndarray, times_s: np.ndarray, *, thorough: bool) -> JointPath:
-        linked = np.ones(len(T) - 1, bool)
+    def path(
+        T: np.ndarray, torso: np.ndarray, times_s: np.ndarray, *, surrounded: Surrounded | None, thorough: bool
+    ) -> JointPath:
+        linked, every = np.ones(len(T) - 1, bool), np.ones(len(T), bool)
         if broken is not None:
             linked[broken] = False
-        return JointPath(4 * T[:, 1:3, 3], np.ones(len(T), bool), linked)
+        return JointPath(4 * T[:, 1:3, 3], every, linked, every, every)
 
     return replace(scenes.platform(0.005), arm=Arm(np.full(2, velocity), np.full(2, acceleration), path))
 
@@ -432,11 +435,13 @@ def test_results_come_back(room_door: tuple[list[Demonstration], AdaptationResul
     np.testing.assert_array_equal(back.grasp, result.grasp)
     assert back.report.convergence.iterations == result.report.convergence.iterations
     assert all(b.joints is None for b in back.demonstrations)
-    path = JointPath(np.zeros((60, 2)), np.ones(60, bool), np.arange(59) > 3)
+    path = JointPath(np.zeros((60, 2)), np.ones(60, bool), np.arange(59) > 3, np.arange(60) > 5, np.arange(60) < 50)
     storage.save(tmp_path / "arm", replace(result, demonstrations=(replace(result.demonstrations[0], joints=path),)))
     arm = storage.load(tmp_path / "arm").demonstrations[0].joints
     assert arm is not None
     np.testing.assert_array_equal(arm.linked, path.linked)
+    np.testing.assert_array_equal(arm.scene_clear, path.scene_clear)
+    np.testing.assert_array_equal(arm.clear, path.scene_clear & path.part_clear)
     assert arm.q.shape == (60, 2) and arm.exact.all()
     for a, b in zip(result.demonstrations, back.demonstrations, strict=True):
         np.testing.assert_array_equal(a.T_world_tool, b.T_world_tool)

@@ -13,12 +13,14 @@ from scipy.spatial.transform import Rotation
 from understudy.demonstration import clock, storage
 from understudy.demonstration.alignment import align, on_floor, phase
 from understudy.demonstration.demonstration import FREE, OCCUPIED, UNKNOWN, Demonstration, Segments
+from understudy.demonstration.known_motion import part_points
 from understudy.demonstration.scene_map import RESOLUTION, Sweep, View, occupancy, static_scene
 from understudy.demonstration.segments import MOVING, find_segments, measure_motion
 from understudy.errors import RecordingError, UnderstudyError
 from understudy.floor import find_floor, world_from_camera
 from understudy.geometry import rigid, transform_points
 from understudy.trajectories import PlanarTrack, PoseTrack
+from understudy.types import RegisteredDepth
 from understudy.voxels import cloud
 
 RATE = 10.0
@@ -247,6 +249,52 @@ def test_the_moving_part_is_not_in_the_scene():
     low, high = CUPBOARD
     on_front = (np.abs(scene[:, 0] - low[0]) < 0.04) & (scene[:, 2] > 0.1) & (scene[:, 2] < high[2] - 0.1)
     assert not on_front.any() and len(scene)
+
+
+def test_what_went_away_is_gone_also_where_depth_has_gaps_in_every_frame():
+    """Registered depth is a net: where its gaps are the same in every frame, no pixel of them ever speaks."""
+    T = looking()
+    door = (np.array([2.0, -0.3, 0.0]), np.array([2.1, 0.3, 1.0]))
+    views = []
+    for k in range(8):
+        depth = cast(T, [CUPBOARD, door] if k < 5 else [CUPBOARD])
+        z = np.where(np.add.outer(np.arange(120), np.arange(160)) % 2 == 0, depth.z, np.float32(0))
+        views.append(View(RegisteredDepth(z, depth.camera), np.zeros((0, 18, 3))))
+    scene = static_scene(views, T)
+    inside = ((scene > CUPBOARD[0] - 0.06) & (scene < CUPBOARD[1] + 0.06)).all(axis=1)
+    assert inside.sum() > 100
+    assert (scene[~inside, 2] < 0.1).all(), "the door that went away is still there"
+
+
+def test_a_handle_that_sticks_out_of_the_moving_part_is_not_in_the_scene():
+    bar = np.array([[-0.1, 0.0, z] for z in (0.5, 0.6, 0.7)])
+    front = Sweep(np.eye(4)[None], np.array([-0.01, -0.4, 0.0]), np.array([0.01, 0.4, 1.0]), bar)
+    points = np.array([[0.0, 0, 0.5], [-0.13, 0, 0.65], [-0.13, 0.2, 0.65], [-0.2, 0, 0.65]])
+    assert front.holds(points, 0.06).tolist() == [True, True, False, False]
+
+
+def test_the_part_whose_motion_is_known_is_found_and_the_hand_at_it_is_not():
+    """A drawer with a bracket on its front comes out of a cupboard; somebody's hand with a box is at it meanwhile."""
+    T, still = looking(), np.zeros((0, 18, 3))
+    way = np.concatenate([np.zeros(4), np.linspace(0.1, 0.4, 5), np.full(4, 0.4)])
+    views = []
+    for k, q in enumerate(way):
+        front = (np.array([2.46 - q, -0.4, 0.5]), np.array([2.48 - q, 0.3, 0.9]))
+        bracket = (np.array([2.36 - q, 0.1, 0.6]), np.array([2.46 - q, 0.25, 0.8]))
+        hand = (np.array([2.16 - q, -0.25, 0.6]), np.array([2.3 - q, -0.1, 0.75]))
+        views.append(View(cast(T, [CUPBOARD, front, bracket, *([hand] if 4 <= k < 9 else [])]), still))
+    T_part = np.tile(np.eye(4), (len(way), 1, 1))
+    T_part[:, 0, 3] = 2.44 - way
+    T_part[:, 2, 3] = 0.7
+    T_part[2] = np.nan
+    part = part_points(views, T, T_part)
+    boxes = np.array([[[0.02, -0.4, -0.2], [0.04, 0.3, 0.2]], [[-0.08, 0.1, -0.1], [0.02, 0.25, 0.1]]])
+    beside = np.maximum(boxes[:, None, 0] - part, part - boxes[:, None, 1]).max(axis=2)
+    assert (beside.min(axis=0) < 0.04).all()
+    assert (beside < 0.03).sum(axis=1).min() > 8, "front and bracket"
+    assert np.ptp(part[:, 1]) > 0.6
+    nobody = part_points(views, T, np.full((len(way), 4, 4), np.nan))
+    assert nobody.shape == (0, 3)
 
 
 def test_an_empty_recording_has_an_empty_map():

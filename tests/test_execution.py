@@ -27,12 +27,13 @@ from scipy.stats import binomtest  # noqa: E402
 from understudy import lie  # noqa: E402
 from understudy.actions import ActionModel, RobotPose, Skill, learn  # noqa: E402
 from understudy.adaptation.adapt import adapt  # noqa: E402
+from understudy.adaptation.around import Surrounded  # noqa: E402
+from understudy.adaptation.clearance import GuardedRobot  # noqa: E402
 from understudy.adaptation.fields import collision_free  # noqa: E402
 from understudy.adaptation.platform import Platform  # noqa: E402
 from understudy.demonstration.demonstration import OCCUPIED  # noqa: E402
 from understudy.errors import MissingExtraError, UnderstudyError  # noqa: E402
 from understudy.execution import trials  # noqa: E402
-from understudy.execution.clearance import Around, GuardedRobot  # noqa: E402
 from understudy.execution.control import Arm, HandleEstimate  # noqa: E402
 from understudy.execution.execution import Config, Execution  # noqa: E402
 from understudy.execution.imitation import imitation_plan, unadapted  # noqa: E402
@@ -181,10 +182,10 @@ def test_tables_of_the_robot_are_made_once_however_often_it_is_guarded(
     monkeypatch.setattr(ik, "_tables", WeakKeyDictionary())
     monkeypatch.setattr(ik.SeedTable, "__init__", counted)
     furniture = sample_furniture("drawer", 100_003)
-    around = Around(observe(furniture, furniture.articulation.T_rest))
+    around = observe(furniture, furniture.articulation.T_rest).around()
     for _ in range(3):
         still = np.eye(4)[None]
-        guard = GuardedRobot(robot, around, np.zeros((1, 3)), still, still, np.zeros(1, bool))
+        guard = GuardedRobot(robot, Surrounded(around, np.zeros((1, 3)), still), still, np.zeros(1, bool))
         ik.seed_table(guard)
         del guard
         gc.collect()

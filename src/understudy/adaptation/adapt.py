@@ -12,7 +12,9 @@ from jaxtyping import Bool, Float
 
 from understudy import lie
 from understudy.adaptation import prepare
+from understudy.adaptation.around import Surrounded
 from understudy.adaptation.calibration import Calibration
+from understudy.adaptation.checks import Checked, about_arm
 from understudy.adaptation.clock import Motion, arm_motion, base_motion, gripper_motion, joined, retimed
 from understudy.adaptation.errors import InfeasibleError
 from understudy.adaptation.explain import conflicts, energies_over_time
@@ -97,38 +99,15 @@ def _check(demonstrations: Sequence[Demonstration]) -> None:
             raise UnderstudyError(f"adapt: demonstration {i}: the hand never takes hold (segments.grasp at the end)")
 
 
-@dataclass(frozen=True, eq=False)
-class _Checked:
-    """A state, and what the exact checks say about it."""
-
-    state: State
-    free: Bool[np.ndarray, " n"]
-    """exactly clear of each demonstration's map"""
-    beside: Bool[np.ndarray, " n"]
-    """the base is not where the moving part is"""
-    achieved: Bool[np.ndarray, " n"]
-    """by exact inverse kinematics"""
-    joints: tuple[JointPath | None, ...]
-    """per demonstration"""
-
-    @property
-    def clear(self) -> Bool[np.ndarray, " n"]:
-        """The base hits nothing."""
-        return self.free & self.beside
-
-    @property
-    def failures(self) -> tuple[int, int]:
-        """Samples at which something fails that must not; and at which the base is where the part is."""
-        return int((~(self.free & self.achieved)).sum()), int((~self.beside).sum())
-
-
 class _Adaptation:
     """One call of `adapt`."""
 
     def __init__(self, demonstrations: tuple[Demonstration, ...], platform: Platform, config: AdaptConfig):
         self.demonstrations, self.platform, self.config = demonstrations, platform, config
         self.obstacles = prepare.Obstacles(demonstrations)
-        self.panels = [panel_path(d, object_path(d)) for d in demonstrations]
+        self.arounds = prepare.arounds(demonstrations, self.obstacles)
+        self.objects = [object_path(d) for d in demonstrations]
+        self.panels = [panel_path(d, T) for d, T in zip(demonstrations, self.objects, strict=True)]
         self.notes: list[str] = []
         self.slower = np.ones(len(demonstrations))
 
@@ -168,20 +147,20 @@ class _Adaptation:
         """Values of demonstrations for each step of the chain."""
         return np.repeat(values, [len(d) for d in self.demonstrations])
 
-    def tighten(self, graph: Graph, state: State, converged: bool) -> tuple[_Checked, int, list[Iteration], bool]:
+    def tighten(self, graph: Graph, state: State, converged: bool) -> tuple[Checked, int, list[Iteration], bool]:
         """Larger margins where exact checks fail, the last stage again, until nothing fails; or the best of all."""
         course: list[Iteration] = []
-        stage, every = self.config.schedule[-1], list[tuple[_Checked, Problem, np.ndarray]]()
+        stage, every = self.config.schedule[-1], list[tuple[Checked, Problem, np.ndarray]]()
         for round in range(self.config.rounds):
             found = self.checked(state)
             late = self.late(graph, found)
             every.append((found, graph.problem, self.slower))
-            good = found.clear.all() and found.achieved.mean() >= self.config.target_achievable
+            good = found.clear.all() and found.achieved.mean() >= self.config.target_achievable and found.arm.all()
             if good and (late == 1).all():
                 return found, round, course, converged
             self.slower = self.slower * late
             graph.stretch(self.per_step(late))
-            graph.reach_margin[_widened(~found.achieved)] += _REACH_STEP
+            graph.reach_margin[_widened(~(found.achieved & found.arm))] += _REACH_STEP  # an arm with room has choices
             graph.map_stiffness[_widened(~found.free)] *= _STIFFER
             graph.part_stiffness[_widened(~found.beside)] *= _STIFFER
             if not found.free.all() and graph.obstacle_margin < self.config.margins.obstacle + _MOST_OBSTACLE:
@@ -192,7 +171,7 @@ class _Adaptation:
         found, graph.problem, self.slower = min(every, key=lambda one: one[0].failures)
         return found, self.config.rounds, course, converged
 
-    def late(self, graph: Graph, found: _Checked) -> Float[np.ndarray, " d"]:
+    def late(self, graph: Graph, found: Checked) -> Float[np.ndarray, " d"]:
         """By how much to slow down further: 1 where no grasp is missed and nothing is hit for lack of time."""
         over = graph.excess(found.state)
         failed = np.array([not found.clear[s].all() for s, _ in self.each()])
@@ -200,7 +179,7 @@ class _Adaptation:
         factor = np.minimum(np.clip(over, *_SLOWER), _SLOWEST / self.slower)
         return np.where(failed & (over > _NEARLY) & self.config.slow_down, np.maximum(factor, 1.0), 1.0)
 
-    def checked(self, state: State) -> _Checked:
+    def checked(self, state: State) -> Checked:
         """Exact checks. A joint path proves what it goes through; only the rest is left to inverse kinematics."""
         state = replace(state, torso=np.clip(state.torso, *self.platform.torso_limits))  # to the last digit
         free = [collision_free(d.map, self.platform.footprint, state.base[s]) for s, d in self.each()]
@@ -209,21 +188,25 @@ class _Adaptation:
             for panel, (s, _) in zip(self.panels, self.each(), strict=True)
         ]
         seen = lie.se3_inverse(lie.se2_to_se3(state.base)) @ state.gripper
-        joints = tuple(self.joints(seen[s], state.torso[s], d.times_s) for s, d in self.each())
+        joints = tuple(self.joints(state, number) for number in range(len(self.demonstrations)))
         achieved = np.concatenate(
             [np.zeros(len(d), bool) if j is None else j.exact for j, d in zip(joints, self.demonstrations, strict=True)]
         )
         rest = np.flatnonzero(~achieved)
         if len(rest):
             achieved[rest] = self.platform.achievable(seen[rest], state.torso[rest])
-        return _Checked(state, np.concatenate(free), np.concatenate(beside), achieved, joints)
+        sizes = tuple(len(d) for d in self.demonstrations)
+        return Checked(state, np.concatenate(free), np.concatenate(beside), achieved, joints, sizes)
 
-    def joints(
-        self, T: Float[np.ndarray, "t 4 4"], torso: Float[np.ndarray, " t"], times_s: np.ndarray, thorough: bool = False
-    ) -> JointPath | None:
-        """Of the arm, along one demonstration (base frame)."""
-        arm = self.platform.arm
-        return None if arm is None else arm.path(T, torso, times_s, thorough=thorough)
+    def joints(self, state: State, number: int, thorough: bool = False) -> JointPath | None:
+        """Of the arm, along one demonstration."""
+        arm, (s, d) = self.platform.arm, self.each()[number]
+        if arm is None:
+            return None
+        base = state.base[s]
+        surrounded = Surrounded(self.arounds[number], base, self.objects[number])
+        seen = lie.se3_inverse(lie.se2_to_se3(base)) @ state.gripper[s]
+        return arm.path(seen, state.torso[s], d.times_s, surrounded=surrounded, thorough=thorough)
 
     def each(self) -> list[tuple[slice, Demonstration]]:
         """Demonstrations with their steps in the chain."""
@@ -231,15 +214,14 @@ class _Adaptation:
         steps = [slice(int(a), int(b)) for a, b in pairwise(ends)]
         return list(zip(steps, self.demonstrations, strict=True))
 
-    def parts(self, graph: Graph, found: _Checked) -> tuple[Adapted, ...]:
+    def parts(self, graph: Graph, found: Checked) -> tuple[Adapted, ...]:
         """The result of each demonstration, and notes about clocks and joints."""
         state, problem = found.state, graph.problem
         energies = energies_over_time(graph, state, self.config.schedule[-1])
-        seen = lie.se3_inverse(lie.se2_to_se3(state.base)) @ state.gripper
         out = []
-        for (s, d), slower, joints in zip(self.each(), self.slower, found.joints, strict=True):
-            if joints is not None and not joints.linked.all():
-                joints = self.joints(seen[s], state.torso[s], d.times_s, thorough=True)
+        for number, ((s, d), slower, joints) in enumerate(zip(self.each(), self.slower, found.joints, strict=True)):
+            if joints is not None and not (joints.linked.all() and joints.clear.all()):
+                joints = self.joints(state, number, thorough=True)
             times = d.times_s[0] + slower * (d.times_s - d.times_s[0])
             if self.config.slow_down:
                 times = retimed(self.motion(state, s, joints), times, _SLOWEST)
@@ -270,14 +252,13 @@ class _Adaptation:
         over = 0.0
         for i, ((s, _), a) in enumerate(zip(self.each(), adapted, strict=True)):
             over = max(over, *(x.max(initial=0.0) for x in self.motion(state, s, a.joints).shares(np.diff(a.times_s))))
-            if a.joints is not None and not a.joints.linked.all():
-                at = ", ".join(map(str, np.flatnonzero(~a.joints.linked).tolist()[:6]))
+            if a.joints is not None:
                 which = f"demonstration {i}: " if several else ""
-                self.notes.append(f"{which}no continuous motion of the arm was found after samples {at}")
+                self.notes += [which + words for words in about_arm(a.joints)]
         if over > 1:
             self.notes.append(f"up to {over:.2f} times as fast as {name} can go")
 
-    def refuse(self, graph: Graph, found: _Checked) -> None:
+    def refuse(self, graph: Graph, found: Checked) -> None:
         """Raises InfeasibleError for a result that the robot cannot do; notes what it can nearly do."""
         clear, achieved = found.free, found.achieved
         off, turned = graph.missed(found.state).max(axis=0)

@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float
 
 from understudy import lie
 from understudy.adaptation import parts, prepare
+from understudy.adaptation.around import Around, Surrounded
 from understudy.adaptation.clock import Motion, arm_motion, base_motion
 from understudy.adaptation.fields import collision_free
 from understudy.adaptation.platform import JointPath, Platform
@@ -46,6 +47,8 @@ MORE: Final = {
     "base_acceleration": "greatest base acceleration, m/s^2",
     "within_limits_percent": "within velocity and acceleration limits, %",
     "part_free_percent": "base clear of the moving part, %",
+    "arm_scene_percent": "arm clear of the scene, %",
+    "arm_part_percent": "arm clear of the moving part, %",
     "joint_speed_percent": "greatest joint velocity, % of its limit",
     "joints_within_percent": "arm joints within velocity and acceleration limits, %",
 }
@@ -107,6 +110,10 @@ class Metrics:
     """steps within the base's and torso's velocity limits, the base's acceleration limits"""
     part_free_percent: float = _NAN
     """samples at which no point of the moving part, as far as it is known, is above the footprint"""
+    arm_scene_percent: float = _NAN
+    """of the samples at which its joints are exact: the arm's links touch nothing of the scene's points"""
+    arm_part_percent: float = _NAN
+    """the same with the points of the moving part that were seen"""
     joint_speed_percent: float = _NAN
     """of the fastest joint of the arm over its limit, where the arm's motion is continuous"""
     joints_within_percent: float = _NAN
@@ -132,7 +139,11 @@ def evaluate(demonstrations: Sequence[Demonstration], result: AdaptationResult, 
         raise UnderstudyError(
             f"metrics: {len(demonstrations)} demonstrations, but a result of {len(result.demonstrations)}"
         )
-    before = [_before(d, a.grasp, result, robot) for d, a in zip(demonstrations, result.demonstrations, strict=True)]
+    arounds = prepare.arounds(demonstrations, prepare.Obstacles(demonstrations))
+    before = [
+        _before(d, a.grasp, around, result, robot)
+        for d, around, a in zip(demonstrations, arounds, result.demonstrations, strict=True)
+    ]
     after = [_Path(a.T_world_tool, a.base, a.torso, a.times_s, a.grasp, a.joints) for a in result.demonstrations]
     return {
         "before": _metrics(demonstrations, before, result, robot),
@@ -140,12 +151,15 @@ def evaluate(demonstrations: Sequence[Demonstration], result: AdaptationResult, 
     }
 
 
-def _before(d: Demonstration, grasp: Float[np.ndarray, "4 4"], result: AdaptationResult, robot: Platform) -> _Path:
+def _before(
+    d: Demonstration, grasp: Float[np.ndarray, "4 4"], around: Around, result: AdaptationResult, robot: Platform
+) -> _Path:
     tool, base = prepare.as_shown(d, result.calibration, grasp)
     torso, joints = np.full(len(d), robot.torso_rest), None
     if robot.arm is not None:
         seen_from_base = lie.se3_inverse(lie.se2_to_se3(base)) @ tool
-        joints = robot.arm.path(seen_from_base, torso, d.times_s, thorough=False)
+        surrounded = Surrounded(around, base, parts.object_path(d))
+        joints = robot.arm.path(seen_from_base, torso, d.times_s, surrounded=surrounded, thorough=False)
     return _Path(tool, base, torso, d.times_s, grasp, joints)
 
 
@@ -237,15 +251,20 @@ def _within(motion: Motion, dt: Float[np.ndarray, " n"]) -> Bool[np.ndarray, " n
 
 
 def _arm(paths: Sequence[_Path], robot: Platform) -> list[float]:
-    """Greatest share of a joint's velocity limit, and the share of steps within all limits of joints."""
-    fastest, within = [0.0], []
+    """Shares of samples at which the arm is clear of scene and of part, greatest share of a joint's velocity limit, and
+    the share of steps within all limits of joints.
+    """
+    fastest, within, clear = [0.0], [], []
     for path in paths:
         if path.joints is None:
-            return [_NAN, _NAN]
+            return [_NAN] * 4
+        clear.append(np.column_stack([path.joints.scene_clear, path.joints.part_clear])[path.joints.exact])
         dt, motion = np.diff(path.times_s), arm_motion(robot, path.joints)
         fastest.append(motion.shares(dt)[0].max(initial=0.0))
         within.append(_within(motion, dt) & path.joints.linked)
-    return [100 * float(max(fastest)), 100 * float(np.concatenate(within).mean())]
+    every = np.concatenate(clear)
+    free = 100 * every.mean(axis=0) if len(every) else np.full(2, np.nan)
+    return [*free.tolist(), 100 * float(max(fastest)), 100 * float(np.concatenate(within).mean())]
 
 
 def table(results: Mapping[str, Mapping[str, Metrics]]) -> str:

@@ -9,6 +9,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Bool, Float
 
+from understudy.adaptation.around import Surrounded
 from understudy.errors import UnderstudyError
 
 
@@ -39,6 +40,15 @@ class JointPath:
     """puts the gripper exactly there, within the joints' limits, clear of the robot itself"""
     linked: Bool[np.ndarray, " t-1"]
     """from this sample to the next by a small motion, both exact"""
+    scene_clear: Bool[np.ndarray, " t"]
+    """the arm's links touch nothing that stands around, as far as it is known"""
+    part_clear: Bool[np.ndarray, " t"]
+    """nor the part that moves"""
+
+    @property
+    def clear(self) -> Bool[np.ndarray, " t"]:
+        """The arm touches nothing."""
+        return self.scene_clear & self.part_clear
 
 
 @runtime_checkable
@@ -51,9 +61,12 @@ class JointSearch(Protocol):
         torso: Float[np.ndarray, " t"],
         times_s: Float[np.ndarray, " t"],
         *,
+        surrounded: Surrounded | None,
         thorough: bool,
     ) -> JointPath:
-        """thorough: all solutions of all samples are looked at where few of them did not do; slow."""
+        """surrounded: what the arm should not touch. thorough: all solutions of all samples are looked at where few of
+        them did not do; slow.
+        """
         ...
 
 

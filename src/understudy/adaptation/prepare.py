@@ -10,8 +10,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from understudy import lie
+from understudy.adaptation.around import Around, part_around, points_around
 from understudy.adaptation.calibration import Calibration
-from understudy.adaptation.fields import DistanceField, obstacle_field, point_field, unknown_field
+from understudy.adaptation.fields import DistanceField, obstacle_field, unknown_field
 from understudy.adaptation.parts import mirrored_sides, object_path, panel_path
 from understudy.adaptation.problem import Problem, Surroundings
 from understudy.demonstration.demonstration import Demonstration, OccupancyMap
@@ -78,8 +79,15 @@ def scene_field(demonstration: Demonstration) -> DistanceField | None:
     if not len(path) or not len(points):
         return None
     low, high = np.percentile(path, 2, axis=0) - _SCENE_AROUND_M, np.percentile(path, 98, axis=0) + _SCENE_AROUND_M
-    near = points[((points > low) & (points < high)).all(axis=1)]
-    return point_field(near, low, high, _SCENE_CELL_M) if len(near) else None
+    return points_around(points, low, high, _SCENE_CELL_M)
+
+
+def arounds(demonstrations: Sequence[Demonstration], obstacles: Obstacles) -> list[Around]:
+    """What the arm should not touch in each demonstration."""
+    return [
+        Around(scene, part_around(d.part.astype(np.float64), _SCENE_CELL_M))
+        for d, scene in zip(demonstrations, obstacles.scenes, strict=True)
+    ]
 
 
 class Obstacles:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Bool, Float
 
+from understudy.adaptation.around import Surrounded
 from understudy.adaptation.platform import Arm, JointPath, Platform, Reachability
 from understudy.robot.model import Robot
 
@@ -31,9 +33,10 @@ def platform_of(robot: Robot, reachability: Reachability | None = None) -> Platf
         torso: Float[np.ndarray, " t"],
         times_s: Float[np.ndarray, " t"],
         *,
+        surrounded: Surrounded | None,
         thorough: bool,
     ) -> JointPath:
-        return _joint_path(robot, T_base_tool, torso, times_s, thorough)
+        return joint_path(robot, T_base_tool, torso, times_s, surrounded, thorough)
 
     d = robot.description
     return Platform(
@@ -50,24 +53,67 @@ def platform_of(robot: Robot, reachability: Reachability | None = None) -> Platf
     )
 
 
-def _joint_path(
-    robot: Robot, T: Float[np.ndarray, "t 4 4"], torso: Float[np.ndarray, " t"], times_s: np.ndarray, thorough: bool
+def joint_path(
+    robot: Robot,
+    T: Float[np.ndarray, "t 4 4"],
+    torso: Float[np.ndarray, " t"],
+    times_s: Float[np.ndarray, " t"],
+    surrounded: Surrounded | None,
+    thorough: bool,
 ) -> JointPath:
+    """The path with the fewest failures: samples without exact solution, jumps, samples at which the arm touches what
+    is around. thorough: searches go on until there are none; the first keeps clear, the last does not look around.
+    """
+    best: JointPath | None = None
+    for path in _found(robot, T, torso, times_s, surrounded):
+        joints = _judged(robot, path, surrounded)
+        if best is None or _failures(joints) < _failures(best):
+            best = joints
+        if not thorough or not _failures(best):
+            break
+    assert best is not None
+    return best
+
+
+def _found(
+    robot: Robot,
+    T: Float[np.ndarray, "t 4 4"],
+    torso: Float[np.ndarray, " t"],
+    times_s: Float[np.ndarray, " t"],
+    surrounded: Surrounded | None,
+) -> Iterator[IKPath]:
+    """Joint paths, from searches that take longer and longer."""
+    from understudy.adaptation.clearance import GuardedRobot
     from understudy.robot.ik_bridge import bridged
     from understudy.robot.ik_follow import follow_ik_path
     from understudy.robot.ik_path import solve_ik_path
 
-    found = follow_ik_path(robot, T, torso, times_s)
-    if thorough and found.jumps:
-        found = bridged(robot, found, T)
-    if thorough and _breaks(found):
-        other = bridged(robot, solve_ik_path(robot, T, torso, times_s), T)
-        if _breaks(other) < _breaks(found):
-            found = other
-    linked = found.success[1:] & found.success[:-1]
-    linked[[i - 1 for i in found.jumps]] = False
-    return JointPath(found.q, found.success, linked)
+    robots = [robot] if surrounded is None else [GuardedRobot(robot, surrounded, T), robot]
+    quick = [follow_ik_path(robots[0], T, torso, times_s)]
+    yield quick[0]
+    if quick[0].jumps:
+        yield bridged(robots[0], quick[0], T)
+    for one in robots:
+        yield bridged(one, solve_ik_path(one, T, torso, times_s), T)
 
 
-def _breaks(path: IKPath) -> int:
-    return len(path.jumps) + int((~path.success).sum())
+def _judged(robot: Robot, path: IKPath, surrounded: Surrounded | None) -> JointPath:
+    """What of a path is exact, and clear; a sample that a search gave up because something is there may be exact."""
+    from understudy.adaptation.clearance import arm_clear
+    from understudy.robot.ik import ANGLE_TOLERANCE, POSITION_TOLERANCE
+
+    exact, t = path.success.copy(), len(path.q)
+    near = (path.position_error <= POSITION_TOLERANCE) & (path.angle_error <= ANGLE_TOLERANCE)
+    rows = np.flatnonzero(near & ~exact)
+    if len(rows):
+        exact[rows] = ~robot.collides(path.q[rows], path.torso[rows])
+    linked = exact[1:] & exact[:-1]
+    linked[[i - 1 for i in path.jumps]] = False
+    clear = np.ones((2, t), bool)
+    if surrounded is not None:
+        clear = np.array(arm_clear(robot, surrounded, path.q, path.torso, np.arange(t)))
+    return JointPath(path.q, exact, linked, *clear)
+
+
+def _failures(path: JointPath) -> int:
+    return int((~path.linked).sum() + (~path.exact).sum() + (~path.clear).sum())

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, overload
 
@@ -16,6 +16,7 @@ from understudy.demonstration import clock
 from understudy.demonstration.actor import Candidate, reaching_hands
 from understudy.demonstration.body_tracks import hand_track, hold, on_the_floor, torso_track
 from understudy.demonstration.demonstration import Demonstration
+from understudy.demonstration.known_motion import part_points
 from understudy.demonstration.object_track import ObjectTrack, by_depth, by_markers
 from understudy.demonstration.scene_map import Sweep, View, occupancy, static_scene
 from understudy.demonstration.segments import MOVING, find_segments, measure_motion
@@ -40,6 +41,7 @@ _VIEWS = 14  # frames that the static scene is made of
 _FLOOR_VIEWS, _FLOOR_POINTS = 5, 20_000
 _ENOUGH = 0.5  # share of the motion for which a hand must be known to be judged by its distance
 _POSES = 24  # of the moving part, between closed and open
+_BAR = 9  # points along the handle
 _CACHED = 24  # decoded frames kept in memory
 _SURE_M = 0.075  # sigma of a hand that may say that it has left: one that the body hides is often far off
 _ALIKE = 0.6  # a hand that reaches at least so much as the first is tried, too
@@ -107,7 +109,10 @@ def build(
     segments = find_segments(even, _way(thing.articulation, object), apart)
     if config.teacher == RGBD:
         hand = hold(hand, object, even, segments.slices(len(even))["manipulate"])
-    views = _views(frames, people)
+    chosen = _chosen(frames)
+    views = _views(frames, people, chosen)
+    if config.object == MARKERS:
+        thing = replace(thing, part=part_points(views, T_world_cam, thing.track.T_world_x[chosen]))
     scene = static_scene(views, T_world_cam, _swept(thing))
     return Demonstration(
         task=config.task,
@@ -254,10 +259,14 @@ def _way(articulation: Articulation, object: PoseTrack) -> Float[np.ndarray, " t
     return way
 
 
-def _views(frames: Frames, people: Sequence[FramePeople]) -> list[View]:
-    some = sorted({round(i) for i in np.linspace(0, len(frames) - 1, _VIEWS)})
+def _chosen(frames: Frames) -> list[int]:
+    """The frames that the static scene is made of."""
+    return sorted({round(i) for i in np.linspace(0, len(frames) - 1, _VIEWS)})
+
+
+def _views(frames: Frames, people: Sequence[FramePeople], chosen: Sequence[int]) -> list[View]:
     rows = frames.rows(people)
-    return [View(frames[i].depth, _joints(people[rows[i]].people)) for i in some]
+    return [View(frames[i].depth, _joints(people[rows[i]].people)) for i in chosen]
 
 
 def _joints(people: Sequence[Person]) -> Float[np.ndarray, "k 18 3"]:
@@ -265,7 +274,7 @@ def _joints(people: Sequence[Person]) -> Float[np.ndarray, "k 18 3"]:
 
 
 def _swept(thing: ObjectTrack) -> Sweep | None:
-    """The moving part from closed to open; None if nothing is known of its shape.
+    """The moving part with its handle, from closed to open; None if nothing is known of its shape.
 
     A hinged part reaches to its axis, also where the person hid that.
     """
@@ -278,7 +287,9 @@ def _swept(thing: ObjectTrack) -> Sweep | None:
             [corners, np.where(np.abs(thing.articulation.in_part().direction) > 0.7, 0, axis)[None]]
         )
     low, high = thing.articulation.range
-    return Sweep(thing.articulation.pose(np.linspace(low, high, _POSES)), corners.min(axis=0), corners.max(axis=0))
+    bar = np.linspace(-0.5, 0.5, _BAR)[:, None] * [0, 0, thing.handle.length_m]
+    poses = thing.articulation.pose(np.linspace(low, high, _POSES))
+    return Sweep(poses, corners.min(axis=0), corners.max(axis=0), np.concatenate([thing.part, bar]))
 
 
 def _source(

@@ -17,6 +17,8 @@ from jaxtyping import Bool, Float
 from understudy import lie
 from understudy.actions import ActionModel, Reproduction, RobotPose
 from understudy.adaptation import prepare
+from understudy.adaptation.around import Around, Surrounded
+from understudy.adaptation.clearance import GuardedRobot
 from understudy.adaptation.fields import collision_free
 from understudy.adaptation.graph import Stage, State
 from understudy.adaptation.platform import Platform
@@ -24,7 +26,6 @@ from understudy.adaptation.solver import Chain, Stop, minimise
 from understudy.demonstration.demonstration import Demonstration
 from understudy.errors import UnderstudyError
 from understudy.execution.candidates import APPROACH_S, ExecutionGraph, candidates
-from understudy.execution.clearance import Around, GuardedRobot
 from understudy.execution.outcome import Reason, Stopped
 from understudy.execution.surroundings import Observed
 from understudy.execution.timing import Timed, time_scaled
@@ -182,7 +183,7 @@ def _first_solved(
     """The first candidate that passes the exact checks; or, if none does, one that fails them at very few samples: the
     arm, which follows the handle in small steps, need not do what the planned path does there.
     """
-    around = Around(observed)
+    around = observed.around()
     tried: list[tuple[bool, int, int, ExecutionGraph, _Solution]] = []
     for pivoting in (False, True):
         choices = candidates(task, motion, platform, observed, start, pivoting)
@@ -266,7 +267,8 @@ def _joints(robot: Robot, around: Around, state: State, task: Demonstration, arr
     guarded = np.arange(len(task)) >= _NEAR * arrived
     T_object = prepare.object_path(task)
     for spare in _SPARE_M:
-        guard = GuardedRobot(robot, around, state.base, T_base_tool, T_object, guarded, spare)
+        surrounded = Surrounded(around, state.base, T_object, spare)
+        guard = GuardedRobot(robot, surrounded, T_base_tool, guarded, hand=True)
         path = bridged(guard, solve_ik_path(guard, T_base_tool, state.torso, task.times_s), T_base_tool)
         if path.success[arrived:].all() and not any(jump > arrived for jump in path.jumps):
             break

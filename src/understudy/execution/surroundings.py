@@ -8,6 +8,7 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float, Float32
 
+from understudy.adaptation.around import Around, part_around, points_around
 from understudy.demonstration.demonstration import FREE, OCCUPIED, OccupancyMap
 from understudy.geometry import inverse, transform_points
 from understudy.objects.articulation import Articulation, Handle
@@ -17,6 +18,8 @@ _CELL_M: Final = 0.02
 _BOUNDS: Final = ((-3.6, 2.4), (-2.7, 2.7))  # metres: x, y
 _ROBOT_M: Final = 1.7  # what hangs higher stands in no robot's way
 _SPACING_M: Final = 0.03
+_ARM_CELL_M: Final = 0.025  # of the fields that the arm keeps clear of
+_AROUND_M: Final = np.array([[-1.3, -1.3, -0.8], [1.3, 1.3, 0.6]])  # from the handle, to their corners
 _NEAR_M: Final = 1.2  # of the handle: points beyond are of no interest to the hand
 
 
@@ -42,6 +45,12 @@ class Observed:
         return Observed(
             T_world_object, self.articulation.moved(T_new_old), self.handle, self.map, self.scene, self.part
         )
+
+    def around(self) -> Around:
+        """What the arm must keep clear of."""
+        middle = self.T_world_object[:3, 3]
+        scene = points_around(self.scene, middle + _AROUND_M[0], middle + _AROUND_M[1], _ARM_CELL_M)
+        return Around(scene, part_around(self.part, _ARM_CELL_M))
 
 
 def observe(furniture: Furniture, T_world_object: Float[np.ndarray, "4 4"], opened: float = 0.0) -> Observed:
