@@ -41,8 +41,8 @@ _NOTED: Final = 1.005  # a clock that runs so many times as long is worth a note
 _AROUND: Final = 3  # samples beside a failure whose margins are tightened, too
 _REACH_STEP: Final = 0.015  # metres by which margins are tightened
 _OBSTACLE_STEP: Final = 0.01
-_STARTS: Final = 3  # that the graph is solved from, while exact checks fail
-_EASED: Final = 3  # rounds for the sake of the arm's motion alone
+_STARTS: Final = 4  # that the graph is solved from, while exact checks fail
+_EASED: Final = 6  # rounds for the sake of the arm's motion alone
 _STIFFER: Final = 1.5  # factor on the map's edges where the base is not clear of it
 _MOST_OBSTACLE: Final = 0.02  # in all: more would close doorways
 

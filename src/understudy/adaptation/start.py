@@ -22,6 +22,7 @@ _HEIGHTS: Final = (0.5, 0.85, 0.15)  # of the torso, shares of its range, in the
 _SERVED: Final = 0.3  # mean cost of reach and obstacles along a base path: below, the graph does the rest
 _UNSERVED: Final = 3.0  # above, other families of grasps and other heights are tried
 _HOPELESS: Final = 40.0  # above, neither a turned grasp nor a planned path helps
+_SAME_M: Final = 0.01  # between grasps (a radian is 0.3 m)
 _REFINED: Final = 2
 _TIGHT_M: Final = 0.03  # margin of a planned path: doorways are narrow
 _OTHER_M: Final = 5.0  # of a grasp from those that the hands show (a radian is 0.3 m) that costs 1
@@ -77,10 +78,12 @@ class Starts:
         yield self._settled(best[1])
         if best[1].cost > _HOPELESS:
             return
-        tried = [one for one in tried if one is not best]
         tried += [self._tried(family, grasp, hands) for family, grasp in rest if family is best[1].family]
+        given = [best[1].state.grasp]
         for _, start in sorted(tried, key=lambda one: one[0]):
-            yield self._settled(start)
+            if grasps.distance(start.state.grasp, np.array(given)).min() > _SAME_M:
+                given.append(start.state.grasp)
+                yield self._settled(start)
 
     def _tried(
         self, family: grasps.GraspFamily, grasp: Float[np.ndarray, "4 4"], hands: Float[np.ndarray, "d 4 4"]
