@@ -151,7 +151,7 @@ class _Adaptation:
 
     def settled(self, found: Checked) -> bool:
         """Nothing is left that another start could mend."""
-        return bool(found.clear.all()) and found.achieved.mean() >= self.config.target_achievable
+        return bool(found.clear.all() and found.achieved.mean() >= self.config.target_achievable)
 
     def clocked(self, problem: Problem) -> Problem:
         """The problem, on clocks that are slow enough for the gripper to go with the part."""
