@@ -14,13 +14,16 @@ import pytest
 
 from understudy import lie
 from understudy.adaptation import calibration, edges, grasps, metrics, most, placement, plots, prepare, storage
-from understudy.adaptation.adapt import AdaptConfig, adapt
+from understudy.adaptation.adapt import AdaptConfig, _Adaptation, adapt
 from understudy.adaptation.around import Surrounded
 from understudy.adaptation.calibration import DEFAULT_HAND_TOOL, DEFAULT_TORSO_BASE, Calibration
+from understudy.adaptation.checks import Checked
 from understudy.adaptation.clock import Motion, retimed
 from understudy.adaptation.errors import InfeasibleError
 from understudy.adaptation.fields import collision_free, outline
+from understudy.adaptation.parts import object_path, panel_path
 from understudy.adaptation.platform import Arm, JointPath, Platform
+from understudy.adaptation.problem import State
 from understudy.adaptation.result import AdaptationResult
 from understudy.adaptation.weights import SCHEDULE
 from understudy.demonstration.demonstration import FREE, OCCUPIED, Demonstration
@@ -84,6 +87,39 @@ def test_parts_that_were_seen_are_the_panel() -> None:
     distance = np.linalg.norm(seen - axis, axis=2)
     np.testing.assert_allclose(distance, np.broadcast_to(distance[0], distance.shape), atol=1e-6)
     assert np.abs(seen[0, :, 0]).max() < 1e-6 and seen[-1, :, 0].max() > 0.25  # shut: in the front; open: before it
+
+
+def test_what_hangs_above_the_robot_is_not_in_its_way() -> None:
+    """A bracket high up on a door's leaf sticks out over the base."""
+    d = scenes.demonstration("room_door")
+    leaf = np.array([[-0.05, y, z] for y in np.arange(0.0, 0.8, 0.05) for z in np.arange(-0.9, 1.0, 0.05)])
+    high = np.array([[0.1, 0.4, z] for z in (0.75, 0.85)])  # the handle is 1 m above the floor
+    low = high - [0, 0, 0.5]
+    T = object_path(d)
+    plain, with_high, with_low = (
+        panel_path(replace(d, part=np.concatenate([leaf, *more]).astype(np.float32)), T) for more in ([], [high], [low])
+    )
+    np.testing.assert_array_equal(with_high, plain)
+    assert with_low.shape[1] > plain.shape[1]
+
+
+def test_another_start_is_tried_where_the_first_leads_nowhere(monkeypatch: pytest.MonkeyPatch) -> None:
+    d, platform = scenes.demonstration("swivel_door", seed=3, samples=60), scenes.platform(0.005)
+    first = adapt([d], platform)
+    given: list[np.ndarray] = []
+    checked = _Adaptation.checked
+
+    def spoiled(self: _Adaptation, state: State) -> Checked:
+        found = checked(self, state)
+        if not any(np.allclose(state.grasp, g, atol=1e-3) for g in given):
+            given.append(state.grasp)
+        near = np.allclose(state.grasp, first.grasp, atol=1e-2)
+        return replace(found, free=found.free & (not near))
+
+    monkeypatch.setattr(_Adaptation, "checked", spoiled)
+    second = adapt([d], platform)
+    assert np.abs(second.grasp - first.grasp).max() > 0.02
+    assert all(a.collision_free.all() and a.achievable.all() for a in second.demonstrations)
 
 
 def test_no_outlier_is_followed(room_door: tuple[list[Demonstration], AdaptationResult]) -> None:

@@ -13,11 +13,14 @@ for name in ("pinocchio", "numba"):
 import pinocchio as pin  # noqa: E402
 
 from understudy import lie  # noqa: E402
+from understudy.adaptation.around import Around, Surrounded, points_around  # noqa: E402
+from understudy.adaptation.clearance import arm_clear  # noqa: E402
 from understudy.adaptation.fields import point_field  # noqa: E402
+from understudy.adaptation.robots import joint_path  # noqa: E402
 from understudy.errors import MissingExtraError  # noqa: E402
 from understudy.robot import urdf  # noqa: E402
 from understudy.robot.arm_surface import arm_surface  # noqa: E402
-from understudy.robot.ik import solve_ik  # noqa: E402
+from understudy.robot.ik import pose_distance, solve_ik  # noqa: E402
 from understudy.robot.ik_bridge import bridged  # noqa: E402
 from understudy.robot.ik_path import JUMP_RAD, IKPath  # noqa: E402
 from understudy.robot.model import Robot, load_robot  # noqa: E402
@@ -127,3 +130,53 @@ def test_clear_is_the_least_distance_of_all_points(robot: Robot) -> None:
         sure = np.abs(nearest - least) > 1e-9
         clear = surface.clear(x, T, field.values, field.origin, field.cell_m, least)
         assert (clear == (nearest >= least))[sure].all() and clear.any() and not clear.all()
+
+
+def elbow_in_the_way(robot: Robot) -> tuple[np.ndarray, np.ndarray, Surrounded]:
+    """A tool that moves a little, and something that stands where the elbow goes if nobody looks."""
+    t = 12
+    height = np.full(t, 0.5 * sum(robot.torso_limits))
+    T = np.repeat(robot.forward(robot.description.posture[None], height[:1]), t, axis=0)
+    T[:, 2, 3] += np.linspace(0, 0.04, t)
+    free = joint_path(robot, T, height, 0.1 * np.arange(t), None, thorough=False)
+    surface = arm_surface(robot)
+    links = surface.at(robot.stack(free.q, height))[:, surface.joint == surface.joint.min()]
+    out = links[t // 2, np.argmax(np.linalg.norm(links[t // 2] - T[t // 2, :3, 3], axis=1))]
+    field = points_around(out[None], out - 1.5, out + 1.5, 0.03)
+    poses = np.tile(np.eye(4), (t, 1, 1))
+    return T, height, Surrounded(Around(field, None), np.zeros((t, 3)), poses)
+
+
+def test_the_arm_goes_round_what_its_elbow_would_meet(robot: Robot) -> None:
+    T, height, surrounded = elbow_in_the_way(robot)
+    times = 0.1 * np.arange(len(T))
+    blind = joint_path(robot, T, height, times, None, thorough=False)
+    every = np.arange(len(T))
+    assert not arm_clear(robot, surrounded, blind.q, height, every)[0].all(), "nothing is in the way"
+    seeing = joint_path(robot, T, height, times, surrounded, thorough=True)
+    assert seeing.exact.all() and seeing.linked.all() and seeing.clear.all()
+    assert arm_clear(robot, surrounded, seeing.q, height, every)[0].all()
+    apart, turned = pose_distance(robot.forward(seeing.q, height), T)
+    assert apart.max() <= 1e-4 and turned.max() <= 1e-3
+
+
+def test_an_arm_that_cannot_be_clear_says_where(robot: Robot) -> None:
+    """Everything around the arm is full: the path stays exact, and is honest about it."""
+    T, height, surrounded = elbow_in_the_way(robot)
+    full = point_field(np.zeros((1, 3)), np.full(3, -2.0), np.full(3, 2.0), 0.1)
+    wall = replace(surrounded, around=Around(replace(full, values=np.full_like(full.values, -1.0)), None))
+    path = joint_path(robot, T, height, 0.1 * np.arange(len(T)), wall, thorough=True)
+    assert path.exact.all() and path.linked.all()
+    assert not path.scene_clear.any() and path.part_clear.all() and not path.clear.any()
+
+
+def test_a_part_is_met_where_it_is_at_that_moment(robot: Robot) -> None:
+    """The part's field is in its own frame: the same posture is clear before the part has come, and not after."""
+    T, height, surrounded = elbow_in_the_way(robot)
+    q = joint_path(robot, T, height, 0.1 * np.arange(len(T)), None, thorough=False).q
+    poses = np.tile(np.eye(4), (len(T), 1, 1))
+    poses[:6, 0, 3] = 1.0
+    moving = Surrounded(Around(None, surrounded.around.scene), surrounded.base, poses)
+    still = arm_clear(robot, surrounded, q, height, np.arange(len(T)))[0]
+    scene, part = arm_clear(robot, moving, q, height, np.arange(len(T)))
+    assert scene.all() and part[:6].all() and (part[6:] == still[6:]).all() and not part[6:].all()

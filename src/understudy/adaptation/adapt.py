@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
+from itertools import islice, pairwise
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -13,8 +13,9 @@ from jaxtyping import Bool, Float
 from understudy import lie
 from understudy.adaptation import prepare
 from understudy.adaptation.around import Surrounded
+from understudy.adaptation.attempt import LOOSE, Attempt
 from understudy.adaptation.calibration import Calibration
-from understudy.adaptation.checks import Checked, about_arm
+from understudy.adaptation.checks import Checked, about_arm, at_ease
 from understudy.adaptation.clock import Motion, arm_motion, base_motion, gripper_motion, joined, retimed
 from understudy.adaptation.errors import InfeasibleError
 from understudy.adaptation.explain import conflicts, energies_over_time
@@ -24,7 +25,7 @@ from understudy.adaptation.parts import beside_part, object_path, panel_path
 from understudy.adaptation.platform import JointPath, Platform
 from understudy.adaptation.result import AdaptationResult, Adapted, Report
 from understudy.adaptation.solver import Chain, Convergence, Iteration, Stop, Stopwatch, minimise
-from understudy.adaptation.start import Starts
+from understudy.adaptation.start import Start, Starts
 from understudy.adaptation.weights import SCHEDULE, Limits, Margins, Stage, Weights
 from understudy.demonstration.demonstration import Demonstration
 from understudy.errors import UnderstudyError
@@ -32,8 +33,7 @@ from understudy.errors import UnderstudyError
 if TYPE_CHECKING:
     from understudy.robot.model import Robot
 
-_LOOSE: Final = 0.002  # metres and radians: a grasp that is missed by more is none
-_EXACT: Final = 0.0005  # the same, of a good one
+_EXACT: Final = 0.0005  # metres and radians by which a good grasp may be missed
 _NEARLY: Final = 0.93  # of a limit: where its edges begin to push
 _SLOWER: Final = (1.15, 1.5)  # least and greatest factor by which the clock is slowed down at a time
 _SLOWEST: Final = 5.0  # times the demonstration's clock: beyond, time is not what is short
@@ -41,6 +41,8 @@ _NOTED: Final = 1.005  # a clock that runs so many times as long is worth a note
 _AROUND: Final = 3  # samples beside a failure whose margins are tightened, too
 _REACH_STEP: Final = 0.015  # metres by which margins are tightened
 _OBSTACLE_STEP: Final = 0.01
+_STARTS: Final = 4  # that the graph is solved from, while exact checks fail
+_EASED: Final = 6  # rounds for the sake of the arm's motion alone
 _STIFFER: Final = 1.5  # factor on the map's edges where the base is not clear of it
 _MOST_OBSTACLE: Final = 0.02  # in all: more would close doorways
 
@@ -116,25 +118,40 @@ class _Adaptation:
         starts = Starts(self.demonstrations, self.platform, self.config.calibration, self.obstacles)
         if not len(starts.hands()):
             self.notes.append("no hand was measured on the object: the grasp is a frontal one, X is the default")
-        start = starts.best()
+        every = []
+        for start in islice(starts.ranked(), _STARTS):
+            every.append(self.attempt(start))
+            if self.settled(every[-1].found):
+                break
+        best = min(every, key=lambda one: one.rank)
+        graph, found, self.slower = best.graph, best.found, best.slower
+        self.refuse(graph, found)
+        if not best.convergence.converged:
+            self.notes.append("the solver stopped at its limit of iterations")
+        adapted = self.parts(graph, found)
+        report = Report(best.convergence, best.rounds, tuple(self.notes))
+        task, grasp = self.demonstrations[0].task, graph.problem.grasp
+        return AdaptationResult(task, self.platform.name, adapted, grasp, best.start.calibration, report)
+
+    def attempt(self, start: Start) -> Attempt:
+        """The graph, solved from a start, with its exact checks."""
         config, watch = self.config, Stopwatch()
+        self.slower = np.ones(len(self.demonstrations))
         graph = Graph(self.clocked(start.problem), self.platform, config.weights, config.margins, config.limits)
         state, course = start.state, list[Iteration]()
         converged = True
-        for number, stage in enumerate(self.config.schedule):
+        for number, stage in enumerate(config.schedule):
             state, part, converged = _solve(graph, state, stage, number)
             course += part
-            if number + 1 < len(self.config.schedule):
+            if number + 1 < len(config.schedule):
                 graph.with_grasp(start.family.nearest(state.grasp))
         found, rounds, part, converged = self.tighten(graph, state, converged)
-        course += part
-        self.refuse(graph, found)
-        if not converged:
-            self.notes.append("the solver stopped at its limit of iterations")
-        adapted = self.parts(graph, found)
-        report = Report(Convergence(tuple(course), converged, *watch.read()), rounds, tuple(self.notes))
-        first = self.demonstrations[0]
-        return AdaptationResult(first.task, self.platform.name, adapted, graph.problem.grasp, start.calibration, report)
+        convergence = Convergence((*course, *part), converged, *watch.read())
+        return Attempt(start, graph, found, self.slower, rounds, convergence)
+
+    def settled(self, found: Checked) -> bool:
+        """Nothing is left that another start could mend."""
+        return bool(found.clear.all() and found.achieved.mean() >= self.config.target_achievable)
 
     def clocked(self, problem: Problem) -> Problem:
         """The problem, on clocks that are slow enough for the gripper to go with the part."""
@@ -148,28 +165,42 @@ class _Adaptation:
         return np.repeat(values, [len(d) for d in self.demonstrations])
 
     def tighten(self, graph: Graph, state: State, converged: bool) -> tuple[Checked, int, list[Iteration], bool]:
-        """Larger margins where exact checks fail, the last stage again, until nothing fails; or the best of all."""
+        """Larger margins where exact checks fail, the last stage again, until nothing fails; or the best of all. When
+        only the arm is not at ease, a few times: an arm that is not stretched has choices.
+        """
         course: list[Iteration] = []
+        eased = 0
         stage, every = self.config.schedule[-1], list[tuple[Checked, Problem, np.ndarray]]()
         for round in range(self.config.rounds):
             found = self.checked(state)
+            sound = self.settled(found)
+            found = self.eased(found) if sound else found
             late = self.late(graph, found)
             every.append((found, graph.problem, self.slower))
-            good = found.clear.all() and found.achieved.mean() >= self.config.target_achievable and found.arm.all()
-            if good and (late == 1).all():
-                return found, round, course, converged
+            if sound and (late == 1).all() and (found.arm.all() or eased >= _EASED):
+                break
+            eased += sound
             self.slower = self.slower * late
             graph.stretch(self.per_step(late))
-            graph.reach_margin[_widened(~(found.achieved & found.arm))] += _REACH_STEP  # an arm with room has choices
+            graph.reach_margin[_widened(~(found.achieved & (found.arm | (not sound))))] += _REACH_STEP
             graph.map_stiffness[_widened(~found.free)] *= _STIFFER
             graph.part_stiffness[_widened(~found.beside)] *= _STIFFER
             if not found.free.all() and graph.obstacle_margin < self.config.margins.obstacle + _MOST_OBSTACLE:
                 graph.obstacle_margin += _OBSTACLE_STEP
             state, part, converged = _solve(graph, state, stage, len(self.config.schedule) + round)
             course += part
-        every.append((self.checked(state), graph.problem, self.slower))
+        else:
+            every.append((self.checked(state), graph.problem, self.slower))
         found, graph.problem, self.slower = min(every, key=lambda one: one[0].failures)
-        return found, self.config.rounds, course, converged
+        return found, len(every) - 1, course, converged
+
+    def eased(self, found: Checked) -> Checked:
+        """The same with a thorough search for joints where the arm is not at ease yet."""
+        joints = tuple(
+            j if j is None or at_ease(j).all() else self.joints(found.state, number, thorough=True)
+            for number, j in enumerate(found.joints)
+        )
+        return replace(found, joints=joints)
 
     def late(self, graph: Graph, found: Checked) -> Float[np.ndarray, " d"]:
         """By how much to slow down further: 1 where no grasp is missed and nothing is hit for lack of time."""
@@ -220,7 +251,7 @@ class _Adaptation:
         energies = energies_over_time(graph, state, self.config.schedule[-1])
         out = []
         for number, ((s, d), slower, joints) in enumerate(zip(self.each(), self.slower, found.joints, strict=True)):
-            if joints is not None and not (joints.linked.all() and joints.clear.all()):
+            if joints is not None and not at_ease(joints).all():
                 joints = self.joints(state, number, thorough=True)
             times = d.times_s[0] + slower * (d.times_s - d.times_s[0])
             if self.config.slow_down:
@@ -262,7 +293,7 @@ class _Adaptation:
         """Raises InfeasibleError for a result that the robot cannot do; notes what it can nearly do."""
         clear, achieved = found.free, found.achieved
         off, turned = graph.missed(found.state).max(axis=0)
-        held = max(off, turned) <= _LOOSE
+        held = max(off, turned) <= LOOSE
         if held and clear.all() and achieved.mean() >= self.config.least_achievable:
             if achieved.mean() < self.config.target_achievable:
                 self.notes.append(f"{100 * achieved.mean():.2f} % of the samples are achievable")

@@ -38,7 +38,7 @@ class Checked:
         is known of joints.
         """
         parts = zip(self.joints, self.sizes, strict=True)
-        return np.concatenate([np.ones(n, bool) if j is None else _at_ease(j) for j, n in parts])
+        return np.concatenate([np.ones(n, bool) if j is None else at_ease(j) for j, n in parts])
 
     @property
     def failures(self) -> tuple[int, int]:
@@ -48,7 +48,8 @@ class Checked:
         return int((~(self.free & self.achieved)).sum()), int((~(self.beside & self.arm)).sum())
 
 
-def _at_ease(path: JointPath) -> Bool[np.ndarray, " t"]:
+def at_ease(path: JointPath) -> Bool[np.ndarray, " t"]:
+    """Where the arm touches nothing, and comes and goes by small motions."""
     return np.asarray(path.clear & np.append(path.linked, True) & np.append(True, path.linked))
 
 

@@ -12,6 +12,7 @@ from understudy import lie
 from understudy.adaptation.errors import InfeasibleError
 from understudy.adaptation.fields import half_planes
 from understudy.demonstration.demonstration import Demonstration
+from understudy.demonstration.scene_map import HEIGHTS
 from understudy.objects.articulation import PRISMATIC, REVOLUTE
 
 _PANEL_SPACING_M: Final = 0.08
@@ -39,7 +40,7 @@ def panel_path(demonstration: Demonstration, T_object: Float[np.ndarray, "t 4 4"
     Where none were seen: of a door about an upright axis, a thin plate from the axis to a little beyond the handle; of
     a part that slides out (drawer), a front of 40 cm; of others nothing.
     """
-    if len(demonstration.part):
+    if len(_in_the_way(demonstration)):
         return _seen_panel(demonstration, T_object)
     a, t = demonstration.articulation, len(T_object)
     out = T_object[:, :3, 0]
@@ -60,9 +61,17 @@ def panel_path(demonstration: Demonstration, T_object: Float[np.ndarray, "t 4 4"
     return np.full((t, 1, 2), np.nan)
 
 
+def _in_the_way(demonstration: Demonstration) -> Float[np.ndarray, "n 3"]:
+    """The part's points at heights that count for a map, too: what hangs above or lies below is in no base's way."""
+    part = demonstration.part.astype(np.float64)
+    T = demonstration.articulation.T_rest
+    height = part @ T[2, :3] + T[2, 3]
+    return np.asarray(part[(height > HEIGHTS[0]) & (height < HEIGHTS[1])])
+
+
 def _seen_panel(demonstration: Demonstration, T_object: Float[np.ndarray, "t 4 4"]) -> Float[np.ndarray, "t m 2"]:
     """One point per cell of a grid, seen from above with the part at rest."""
-    part = demonstration.part.astype(np.float64)
+    part = _in_the_way(demonstration)
     rest = part @ demonstration.articulation.T_rest[:2, :3].T
     _, first = np.unique(np.round(rest / _PANEL_SPACING_M), axis=0, return_index=True)
     R, p = T_object[:, :2, :3], T_object[:, None, :2, 3]

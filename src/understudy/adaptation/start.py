@@ -22,6 +22,7 @@ _HEIGHTS: Final = (0.5, 0.85, 0.15)  # of the torso, shares of its range, in the
 _SERVED: Final = 0.3  # mean cost of reach and obstacles along a base path: below, the graph does the rest
 _UNSERVED: Final = 3.0  # above, other families of grasps and other heights are tried
 _HOPELESS: Final = 40.0  # above, neither a turned grasp nor a planned path helps
+_SAME_M: Final = 0.01  # between grasps (a radian is 0.3 m)
 _REFINED: Final = 2
 _TIGHT_M: Final = 0.03  # margin of a planned path: doorways are narrow
 _OTHER_M: Final = 5.0  # of a grasp from those that the hands show (a radian is 0.3 m) that costs 1
@@ -55,28 +56,46 @@ class Starts:
         """Where a gripper would hold the object if it were the hand."""
         return calibrations.typical_tools(self.demonstrations, self.calibration or Calibration.default())
 
-    def best(self) -> Start:
+    def ranked(self) -> Iterator[Start]:
         """The grasp nearest to the hands of all demonstrations, if a base can serve it; otherwise the one that a base
-        serves best, with how far it is from the hands.
+        serves best, with how far it is from the hands. After it others, best first: for who finds that the first leads
+        nowhere.
         """
         handle = grasps.common_handle([d.handle for d in self.demonstrations])
         hands = self.hands()
-        best: Start | None = None
-        least = np.inf
         ranked = grasps.ranked(handle, self.platform, hands)
-        first = ranked[0][0]
-        for family, grasp in self._candidates(ranked, hands):
-            if family is first and least > _HOPELESS and best is not None:
+        first, rest = ranked[0][0], self._candidates(ranked, hands)
+        tried: list[tuple[float, Start]] = []
+        least = np.inf
+        for family, grasp in rest:
+            if family is first and least > _HOPELESS and tried:
                 continue
-            start = self.of(family, grasp, refined=False)
-            away = float(np.mean(grasps.distance(grasp, hands))) / _OTHER_M if len(hands) else 0.0
-            if start.cost + away < least:
-                best, least = start, start.cost + away
-            if start.cost <= _SERVED or (family is not first and least <= _UNSERVED):
+            tried.append(self._tried(family, grasp, hands))
+            least = min(least, tried[-1][0])
+            if tried[-1][1].cost <= _SERVED or (family is not first and least <= _UNSERVED):
                 break
-        assert best is not None
-        settled = best.cost <= _SERVED or best.cost > _HOPELESS
-        return best if settled else self.of(best.family, best.state.grasp, refined=True)
+        best = min(tried, key=lambda one: one[0])
+        yield self._settled(best[1])
+        if best[1].cost > _HOPELESS:
+            return
+        tried += [self._tried(family, grasp, hands) for family, grasp in rest if family is best[1].family]
+        given = [best[1].state.grasp]
+        for _, start in sorted(tried, key=lambda one: one[0]):
+            if grasps.distance(start.state.grasp, np.array(given)).min() > _SAME_M:
+                given.append(start.state.grasp)
+                yield self._settled(start)
+
+    def _tried(
+        self, family: grasps.GraspFamily, grasp: Float[np.ndarray, "4 4"], hands: Float[np.ndarray, "d 4 4"]
+    ) -> tuple[float, Start]:
+        """A start, and what it costs together with how far it is from the hands."""
+        start = self.of(family, grasp, refined=False)
+        return start.cost + (float(np.mean(grasps.distance(grasp, hands))) / _OTHER_M if len(hands) else 0.0), start
+
+    def _settled(self, start: Start) -> Start:
+        """With planned base paths where those near the torso do not serve and there is hope."""
+        settled = start.cost <= _SERVED or start.cost > _HOPELESS
+        return start if settled else self.of(start.family, start.state.grasp, refined=True)
 
     def _candidates(self, ranked: list[Grasp], hands: Float[np.ndarray, "d 4 4"]) -> Iterator[Grasp]:
         """The nearest grasp of each family; after the first, others of its family."""

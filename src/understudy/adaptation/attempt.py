@@ -1,0 +1,35 @@
+"""One start, what the graph made of it, and what the exact checks say."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from jaxtyping import Float
+
+from understudy.adaptation.checks import Checked
+from understudy.adaptation.graph import Graph
+from understudy.adaptation.solver import Convergence
+from understudy.adaptation.start import Start
+
+LOOSE: Final = 0.002
+"""metres and radians: a grasp that is missed by more is none"""
+
+
+@dataclass(frozen=True, eq=False)
+class Attempt:
+    """From one start to a solution."""
+
+    start: Start
+    graph: Graph
+    found: Checked
+    slower: Float[np.ndarray, " d"]
+    """times the demonstrations' clocks"""
+    rounds: int
+    convergence: Convergence
+
+    @property
+    def rank(self) -> tuple[bool, int, int]:
+        """The least is best: a grasp that is none; then samples that fail."""
+        return float(self.graph.missed(self.found.state).max()) > LOOSE, *self.found.failures
