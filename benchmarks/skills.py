@@ -32,7 +32,7 @@ from understudy.execution.imitation import imitation_plan, unadapted
 from understudy.execution.planning import make_plan
 from understudy.files import write_atomically
 from understudy.robot import load_robot
-from understudy.teaching_motions import robot_motions
+from understudy.teaching_motions import robot_motions, too_short
 
 ROWS = {
     "all": "all demonstrations",
@@ -46,13 +46,16 @@ def learnt(task: str, row: str, shown: list[Demonstration], platform: Platform, 
     """The skill of one row, made once."""
     if (folder / "skill.json").exists():
         return load_skill(folder)
+    short = [why for d in shown if (why := too_short(d))]
+    usable = [d for d in shown if not too_short(d)]  # as `understudy teach` does
     if row == "one":
-        shown = first_feasible(shown, platform)
-    result, left_out = adapt_most(shown, platform)
-    kept = [d for i, d in enumerate(shown) if i not in left_out]
+        usable = first_feasible(usable, platform)
+    result, left_out = adapt_most(usable, platform)
+    kept = [d for i, d in enumerate(usable) if i not in left_out]
     if row == "imitation":
         result = unadapted(kept, result, platform)
-    used = {"demonstrations": len(kept), "of": len(shown), "left out": list(left_out.values())}
+    of = 1 if row == "one" else len(shown)
+    used = {"demonstrations": len(kept), "of": of, "left out": [*short, *left_out.values()]}
     skill = Skill(learn(robot_motions(kept, result)), task, "pr2", used)
     save_skill(folder, skill)
     return skill
