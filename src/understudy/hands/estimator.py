@@ -133,7 +133,7 @@ def hypotheses(person: Person, side: str) -> list[HandView]:
     as large as its sigma says; a wrist that is known well enough has the first only. None without an arm.
     """
     row = JOINT[f"{side}_wrist"]
-    first = HandView.of(person.keypoints, side)
+    first = HandView.of(person.keypoints, side, person.sigma_m)
     if first is None:
         return []
     sigma = min(float(np.nan_to_num(person.sigma_m[row], nan=_SIGMA_MOST)) / _BALL, _SIGMA_MOST)
@@ -144,7 +144,7 @@ def hypotheses(person: Person, side: str) -> list[HandView]:
     steps = _STEP * sigma * _TETRAHEDRON @ rotation_to(ray) * mirror
     moved = np.repeat(person.keypoints[None], len(steps), axis=0)
     moved[:, row] += steps
-    return [first, *(view for joints in moved if (view := HandView.of(joints, side)) is not None)]
+    return [first, *(view for joints in moved if (view := HandView.of(joints, side, person.sigma_m)) is not None)]
 
 
 def _crops(depth: RegisteredDepth, views: Sequence[HandView]) -> list[Float32[np.ndarray, "2 48 48"]]:
