@@ -9,17 +9,17 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float, Float32, UInt8
 
 from understudy.camera import Camera
 from understudy.errors import ModelFileError, UnderstudyError
 from understudy.hands.color_path import SIDES, ColorPalm, ColorPath
-from understudy.hands.crop import CELL, CELLS, EMPTY, HandView
+from understudy.hands.crop import CELL, CELLS, EMPTY, GREY, PIXELS, HandView
 from understudy.hands.nets import HandNets, load_nets
 from understudy.hands.predictor import HandPrediction, HandPredictor, color_word, pooled
 from understudy.registration import register
 from understudy.skeleton import JOINT
-from understudy.types import OBSERVED, Frame, Hands, Palm, Person, RegisteredDepth, RegisteredFrame
+from understudy.types import OBSERVED, Frame, Hands, Palm, Person, RegisteredFrame
 from understudy.voxels import rotation_to
 
 LEAST_CONFIDENCE: Final = 0.18
@@ -61,6 +61,7 @@ class HandNormalEstimator:
             raise UnderstudyError(f"least_confidence {least_confidence}: must be in [0, 1]")
         self.least_confidence = least_confidence
         self.predictor = HandPredictor(weights)
+        self.color = color
         self.color_path: ColorPath | None = None
         if color:
             try:
@@ -78,7 +79,7 @@ class HandNormalEstimator:
         places = [self._views(registered.camera, person) for person in people]
         words = [self._words(registered, person, views) for person, (views, _) in zip(people, places, strict=True)]
         hands = [
-            _Hand(i, side, several, np.stack(_crops(registered.depth, several)), words[i].get(side))
+            _Hand(i, side, several, *_crops(registered, several, self.color), words[i].get(side))
             for i, (views, _) in enumerate(places)
             for side, several in views.items()
         ]
@@ -98,9 +99,9 @@ class HandNormalEstimator:
         if not hands:
             return []
         color = np.stack([color_word(view, hand.color) for hand in hands for view in hand.views])
-        return self.predictor(
-            [v for hand in hands for v in hand.views], np.concatenate([h.crops for h in hands]), color
-        )
+        views = [v for hand in hands for v in hand.views]
+        depth, image = (np.concatenate([getattr(h, name) for h in hands]) for name in ("crops", "images"))
+        return self.predictor(views, depth, color, image)
 
     def _views(self, camera: Camera, person: Person) -> tuple[dict[str, list[HandView]], dict[str, str]]:
         """The views of each hand, or why there are none."""
@@ -147,11 +148,17 @@ def hypotheses(person: Person, side: str) -> list[HandView]:
     return [first, *(view for joints in moved if (view := HandView.of(joints, side, person.sigma_m)) is not None)]
 
 
-def _crops(depth: RegisteredDepth, views: Sequence[HandView]) -> list[Float32[np.ndarray, "2 48 48"]]:
-    """The depth crops of several views of one hand."""
+def _crops(
+    frame: RegisteredFrame, views: Sequence[HandView], color: bool
+) -> tuple[Float32[np.ndarray, "n 2 48 48"], UInt8[np.ndarray, "n 72 72 3"]]:
+    """The crops of depth and colour image of several views of one hand; the latter GREY when it is not to be used."""
     apart = max(float(np.linalg.norm(view.center - views[0].center)) for view in views)
-    cloud = views[0].points_near(depth, apart)
-    return [view.depth_crop(cloud) for view in views]
+    cloud = views[0].points_near(frame.depth, apart)
+    if color:
+        images = np.stack([view.color_crop(frame.camera, frame.color) for view in views])
+    else:
+        images = np.full((len(views), PIXELS, PIXELS, 3), GREY, np.uint8)
+    return np.stack([view.depth_crop(cloud) for view in views]), images
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,6 +170,7 @@ class _Hand:
     side: str
     views: list[HandView]
     crops: Float32[np.ndarray, "n 2 48 48"]
+    images: UInt8[np.ndarray, "n 72 72 3"]
     color: ColorPalm | None
 
     def palm(self, camera: Camera, word: HandPrediction) -> Palm:
