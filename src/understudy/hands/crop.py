@@ -121,22 +121,20 @@ class HandView:
         np.minimum.at(near, cell, depth[inside].clip(max=LIMIT).astype(np.float32))
         return np.stack([near, (near < EMPTY).astype(np.float32)]).reshape(2, CELLS, CELLS)
 
-    def color_crop(self, camera: Camera, image: np.ndarray) -> UInt8[np.ndarray, "72 72 3"]:
+    def color_crop(self, camera: Camera, image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "72 72 3"]:
         """The colour image as it is seen along the view, `PIXELS` columns across `2 * HALF` at the centre's distance;
-        GREY outside the image. camera: of the image, (H, W, 3) uint8.
+        GREY outside the image. camera: of the image.
         """
         finer = int(np.clip(round(PIXEL * camera.fx / self.distance), 1, _SHARPEST))
         offset = (np.arange(PIXELS) + 0.5 - PIXELS / 2) * PIXEL / self.distance
         x, y = np.meshgrid(offset, offset)
         rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3) @ self.R
         uv = np.nan_to_num(camera.project(rays), nan=-1e4).astype(np.float32).reshape(PIXELS, PIXELS, 2)
-        if finer > 1:
-            uv = cv2.resize(uv, None, fx=finer, fy=finer, interpolation=cv2.INTER_LINEAR)
+        u, v = cv2.split(cv2.resize(uv, None, fx=finer, fy=finer, interpolation=cv2.INTER_LINEAR))
         grey = (GREY, GREY, GREY)
-        seen = cv2.remap(image, uv, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=grey)
-        if finer > 1:
-            seen = cv2.resize(seen, (PIXELS, PIXELS), interpolation=cv2.INTER_AREA)
-        return seen
+        seen = cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=grey)
+        small: np.ndarray = cv2.resize(seen, (PIXELS, PIXELS), interpolation=cv2.INTER_AREA)
+        return small
 
     def points_near(self, depth: RegisteredDepth, margin: float = 0.0) -> Float[np.ndarray, "n 3"]:
         """The measured points that `depth_crop` needs: those in the crop's part of the image.

@@ -334,7 +334,7 @@ class HandSamples:
         return hand_image(draw, scene)
 
     def _rest(self, people: _People, side: str, mirror: Tensor) -> Float[Tensor, "b n 3"]:
-        """Points of the body without the arm's end: colour camera's frame, mirrored; NaN for those that are left out."""
+        """Points of the body; NaN where they are the arm's end. Colour camera's frame, mirrored."""
         gone = torch.where(self._limb[side][self._keep], torch.nan, 0.0)[:, None]
         return people.cameras.to_cam(people.points[:, self._keep]) * mirror + gone
 
