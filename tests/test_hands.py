@@ -273,7 +273,7 @@ def test_without_the_colour_networks_depth_is_used(monkeypatch: pytest.MonkeyPat
         raise ModelFileError("offline: run `understudy models fetch`")
 
     monkeypatch.setattr(hands_module, "load_nets", absent)
-    with pytest.warns(UserWarning, match="depth alone.*understudy models fetch"):
+    with pytest.warns(UserWarning, match="without the colour path.*understudy models fetch"):
         estimator = HandNormalEstimator()
     assert estimator.color_path is None
     assert estimator.estimate(frame_of(), person(skeleton(7) - [0.2, 0, 0])) is not None

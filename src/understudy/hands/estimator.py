@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -24,6 +24,8 @@ from understudy.voxels import rotation_to
 
 LEAST_CONFIDENCE: Final = 0.18
 """Palms below are left out."""
+ASK: Final = 0.8
+"""Palms below, of wrists that are seen, are looked for by the colour path, too."""
 
 _BALL = 1.87  # radius that holds 68 % of a normal distribution in space, in sigmas along an axis
 _SIGMA_LEAST, _SIGMA_MOST = 0.03, 0.12  # metres along an axis: of wrists that are looked for in several places
@@ -39,11 +41,12 @@ class HandNormalEstimator:
     """Which way the palms of an estimated person face, in the colour camera's frame.
 
     1. `HandView`: where the body says that a hand is, how large and how turned; left or right is the body's word.
-    2. `ColorPath`: palm detection and hand landmarks on crops of the colour image, where the wrist is seen (optional).
-    3. `HandView.depth_crop`: the depth around the hand; several crops, as far apart as the wrist is uncertain.
-    4. `HandPredictor`: a network that is told the depth, the body's joints and the colour path's word, trained to weigh
-       them; where the fingers cannot be seen, what the forearm and the posture make likely is left. `pooled` joins what
-       it says of the crops.
+    2. `HandView.depth_crop`, `color_crop`: depth and colour around the hand; several crops, as far apart as the wrist
+       is uncertain.
+    3. `HandPredictor`: a network that is told both, and the body's joints, trained to weigh them; where the fingers
+       cannot be seen, what the forearm and the posture make likely is left. `pooled` joins what it says of the crops.
+    4. `ColorPath`: where that is less sure than `ASK`, and the wrist is seen, palm detection and hand landmarks on
+       larger crops of the colour image; the network is asked again, with their word (optional).
     """
 
     def __init__(
@@ -53,9 +56,9 @@ class HandNormalEstimator:
         weights: Path | None = None,
         nets: HandNets | None = None,
     ):
-        """color: use the colour image, too; where its two networks cannot be had, a warning says so and depth alone is
-        used. least_confidence: in [0, 1]; palms that are less sure are left out. weights: an exported network of one's
-        own. nets: the colour path's networks, when they are loaded already.
+        """color: use the colour image, too; where the colour path's two networks cannot be had, a warning says so and
+        it is left out. least_confidence: in [0, 1]; palms that are less sure are left out. weights: an exported network
+        of one's own. nets: the colour path's networks, when they are loaded already.
         """
         if not 0 <= least_confidence <= 1:
             raise UnderstudyError(f"least_confidence {least_confidence}: must be in [0, 1]")
@@ -67,7 +70,7 @@ class HandNormalEstimator:
             try:
                 self.color_path = ColorPath(nets or load_nets())
             except ModelFileError as e:
-                warnings.warn(f"palms are estimated from depth alone: {e}", stacklevel=2)
+                warnings.warn(f"palms are estimated without the colour path: {e}", stacklevel=2)
 
     def estimate(self, frame: Frame | RegisteredFrame, person: Person) -> Hands:
         """'left', 'right' -> Palm, or None; `Hands.why` then says why."""
@@ -77,16 +80,16 @@ class HandNormalEstimator:
         """The hands of several people of one frame."""
         registered = frame if isinstance(frame, RegisteredFrame) else register(frame)
         places = [self._views(registered.camera, person) for person in people]
-        words = [self._words(registered, person, views) for person, (views, _) in zip(people, places, strict=True)]
         hands = [
-            _Hand(i, side, several, *_crops(registered, several, self.color), words[i].get(side))
+            _Hand(i, side, several, *_crops(registered, several, self.color))
             for i, (views, _) in enumerate(places)
             for side, several in views.items()
         ]
-        said = iter(self._predict(hands))
+        words = self._predict(hands)
+        if self.color_path is not None:
+            self._ask_color(self.color_path, registered, people, hands, words)
         palms: list[dict[str, Palm]] = [{} for _ in people]
-        for hand in hands:
-            word = pooled([next(said) for _ in hand.views])
+        for hand, word in zip(hands, words, strict=True):
             if word.confidence < self.least_confidence:
                 why = f"too unsure: within 30 degrees with a probability of {word.confidence:.2f} only"
                 places[hand.person][1][hand.side] = why
@@ -94,14 +97,44 @@ class HandNormalEstimator:
                 palms[hand.person][hand.side] = hand.palm(registered.camera, word)
         return [Hands(p.get("left"), p.get("right"), why) for p, (_, why) in zip(palms, places, strict=True)]
 
+    def _ask_color(
+        self,
+        path: ColorPath,
+        frame: RegisteredFrame,
+        people: Sequence[Person],
+        hands: list[_Hand],
+        words: list[HandPrediction],
+    ) -> None:
+        """Where a hand that can be seen is not known well: what the network says with the colour path's word, in place.
+
+        Hands that it finds carry it then.
+        """
+        found: list[int] = []
+        for number, person in enumerate(people):
+            unsure = {
+                hand.side: i
+                for i, hand in enumerate(hands)
+                if hand.person == number
+                and words[i].confidence < ASK
+                and person.source[JOINT[f"{hand.side}_wrist"]] == OBSERVED
+            }
+            if unsure:
+                for side, palm in path.estimate(frame, person, list(unsure)).items():
+                    if palm is not None:
+                        hands[unsure[side]] = replace(hands[unsure[side]], color=palm)
+                        found.append(unsure[side])
+        for i, word in zip(found, self._predict([hands[i] for i in found]), strict=True):
+            words[i] = word
+
     def _predict(self, hands: Sequence[_Hand]) -> list[HandPrediction]:
-        """Of all views of all hands."""
+        """Of each hand, from all its views."""
         if not hands:
             return []
         color = np.stack([color_word(view, hand.color) for hand in hands for view in hand.views])
         views = [v for hand in hands for v in hand.views]
         depth, image = (np.concatenate([getattr(h, name) for h in hands]) for name in ("crops", "images"))
-        return self.predictor(views, depth, color, image)
+        said = iter(self.predictor(views, depth, color, image))
+        return [pooled([next(said) for _ in hand.views]) for hand in hands]
 
     def _views(self, camera: Camera, person: Person) -> tuple[dict[str, list[HandView]], dict[str, str]]:
         """The views of each hand, or why there are none."""
@@ -119,14 +152,6 @@ class HandNormalEstimator:
             else:
                 views[side] = several
         return views, why
-
-    def _words(
-        self, frame: RegisteredFrame, person: Person, views: dict[str, list[HandView]]
-    ) -> dict[str, ColorPalm | None]:
-        if self.color_path is None or not views:
-            return {}
-        seen = [side for side in views if person.source[JOINT[f"{side}_wrist"]] == OBSERVED]
-        return self.color_path.estimate(frame, person, seen)
 
 
 def hypotheses(person: Person, side: str) -> list[HandView]:
@@ -171,7 +196,8 @@ class _Hand:
     views: list[HandView]
     crops: Float32[np.ndarray, "n 2 48 48"]
     images: UInt8[np.ndarray, "n 72 72 3"]
-    color: ColorPalm | None
+    color: ColorPalm | None = None
+    """what the colour path says, where it was asked and found the palm"""
 
     def palm(self, camera: Camera, word: HandPrediction) -> Palm:
         """The result, from the pooled prediction."""
