@@ -95,7 +95,8 @@ def _card(
     return f"""# {_NAME}
 
 Says which way a palm faces (and where its fingers point, and 21 keypoints) from depth and colour around the hand, the
-joints of the arm and the body, and, where it is asked, what another colour hand network says; with the probability that the normal is within 30 degrees.
+joints of the arm and the body, and, where it is asked, what another colour hand network says; with the probability
+that the normal is within 30 degrees.
 
 - Files: {files}; {parameters:,} parameters.
 - Input and output: `understudy.hands.crop.HandView`, `understudy.hands.net`.
