@@ -30,6 +30,6 @@ class Attempt:
     convergence: Convergence
 
     @property
-    def rank(self) -> tuple[bool, int, int]:
-        """The least is best: a grasp that is none; then samples that fail."""
+    def rank(self) -> tuple[bool, bool, int, int]:
+        """The least is best: a grasp that is none; then what fails."""
         return float(self.graph.missed(self.found.state).max()) > LOOSE, *self.found.failures
