@@ -60,6 +60,8 @@ class Graph:
         t = np.array([w.torso[0], w.torso[0], w.torso[1]]) ** 2
         self._torso_root = inverse_root(problem.torso_covariance[self._torso], np.tile(t, (len(self._torso), 1)))
         self._pairs = np.flatnonzero(np.isfinite(problem.dt))
+        free = np.isnan(problem.hand).any(axis=(1, 2)) & ~problem.holding
+        self._unseen = self._pairs[free[self._pairs] & free[self._pairs + 1]]
         linked = np.isfinite(problem.dt)
         self._triples = np.flatnonzero(linked[:-1] & linked[1:])
         self._holding = np.flatnonzero(problem.holding)
@@ -160,7 +162,21 @@ class Graph:
         out.append(limited(a, u, base, -top, top, limit))
         top = np.array([share * self.platform.torso_velocity])
         out.append(limited(a, lift, torso, -top, top, limit[:1]))
-        return [*out, *self._accelerations((v, Ja, Jb), (u, Ka, Kb), limit)]
+        return [*out, *self._resting(state), *self._accelerations((v, Ja, Jb), (u, Ka, Kb), limit)]
+
+    def _resting(self, state: State) -> list[Linear]:
+        """Where no hand was observed the arm keeps its posture."""
+        a = self._unseen
+        if not len(a):
+            return []
+        b, dt = a + 1, self.problem.dt[a, None]
+        e, before, after = edges.between_postures(state.gripper[a], state.base[a], state.gripper[b], state.base[b])
+        parts = [
+            (step, columns, J / dt[..., None])
+            for step, both in enumerate((before, after))
+            for columns, J in zip((GRIPPER, BASE), both, strict=True)
+        ]
+        return [scaled("posture", a, e / dt, parts, six(self.weights.posture))]
 
     def _accelerations(self, gripper: Rates, base: Rates, limit: np.ndarray) -> list[Linear]:
         w, dt = self.weights, self.problem.dt

@@ -25,6 +25,8 @@ class Weights:
     """metres/s, radians/s"""
     gripper_acceleration: tuple[float, float] | None = (2.0, 6.0)
     """metres/s^2, radians/s^2; None: no such edges"""
+    posture: tuple[float, float] = (0.2, 0.5)
+    """metres/s, radians/s of the gripper as seen from the base, where no hand was observed: the arm rests"""
     base_speed: tuple[float, float] = (0.5, 1.0)
     base_acceleration: tuple[float, float] | None = (0.5, 1.0)
     torso_speed: float = 0.01
