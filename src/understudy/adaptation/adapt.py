@@ -44,7 +44,7 @@ _OBSTACLE_STEP: Final = 0.01
 _STARTS: Final = 4  # that the graph is solved from, while exact checks fail
 _EASED: Final = 6  # rounds for the sake of the arm's motion alone
 _PATIENCE: Final = 4  # rounds without anything better
-_LESS: Final = 0.7  # factor on how much a hand is followed where the arm is not at ease
+_LESS: Final = 0.5  # factor on how much a hand is followed where the arm is not at ease
 _STIFFER: Final = 1.5  # factor on the map's edges where the base is not clear of it
 _MOST_OBSTACLE: Final = 0.02  # in all: more would close doorways
 

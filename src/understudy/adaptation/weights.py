@@ -23,7 +23,7 @@ class Weights:
     """off the straight way, and turned, just before taking hold and after letting go: fingers must pass the handle"""
     gripper_speed: tuple[float, float] = (4.0, 12.0)
     """metres/s, radians/s"""
-    gripper_acceleration: tuple[float, float] | None = (3.0, 9.0)
+    gripper_acceleration: tuple[float, float] | None = (2.0, 6.0)
     """metres/s^2, radians/s^2; None: no such edges"""
     posture: tuple[float, float] = (0.2, 0.5)
     """metres/s, radians/s of the gripper as seen from the base, where no hand was observed: the arm rests"""
