@@ -126,7 +126,7 @@ class _Adaptation:
             if self.settled(every[-1].found):
                 break
         best = min(every, key=lambda one: one.rank)
-        graph, found, self.slower = best.graph, best.found, best.slower
+        graph, found = best.graph, best.found
         self.refuse(graph, found)
         if not best.convergence.converged:
             self.notes.append("the solver stopped at its limit of iterations")
@@ -149,7 +149,7 @@ class _Adaptation:
                 graph.with_grasp(start.family.nearest(state.grasp))
         found, rounds, part, converged = self.tighten(graph, state, converged)
         convergence = Convergence((*course, *part), converged, *watch.read())
-        return Attempt(start, graph, found, self.slower, rounds, convergence)
+        return Attempt(start, graph, found, rounds, convergence)
 
     def settled(self, found: Checked) -> bool:
         """Nothing is left that another start could mend."""
@@ -171,15 +171,16 @@ class _Adaptation:
         only the arm is not at ease, a few times: an arm that is not stretched has choices.
         """
         course: list[Iteration] = []
-        stage, every = self.config.schedule[-1], list[tuple[Checked, Problem, np.ndarray]]()
+        stage, every = self.config.schedule[-1], list[tuple[Checked, Problem, tuple[float, ...]]]()
         tightened = eased = best = 0
         while True:
             found = self.checked(state)
             sound = self.settled(found)
             found = self.eased(found) if sound else found
             late = self.late(graph, found)
-            every.append((found, graph.problem, self.slower))
-            best = min(best, len(every) - 1, key=lambda i: every[i][0].failures)
+            off = float(graph.missed(found.state).max())
+            every.append((found, graph.problem, (off > LOOSE, *found.failures, off > _EXACT)))
+            best = min(best, len(every) - 1, key=lambda i: every[i][2])
             done = eased >= _EASED or found.arm.all() if sound else tightened >= self.config.rounds
             if (done and (not sound or (late == 1).all())) or len(every) - 1 - best >= _PATIENCE:
                 break
@@ -189,11 +190,11 @@ class _Adaptation:
             self.harder(graph, found, sound)
             state, part, converged = _solve(graph, state, stage, len(self.config.schedule) + len(every) - 1)
             course += part
-        found, graph.problem, self.slower = every[best]
+        found, graph.problem, _ = every[best]
         return found, len(every) - 1, course, converged
 
     def harder(self, graph: Graph, found: Checked, sound: bool) -> None:
-        """Larger margins and stiffer edges around what fails; where only the arm does (sound), less of the hand, too."""
+        """Larger margins, stiffer edges around what fails; where only the arm does (sound), less of the hand, too."""
         strained = _widened(~found.arm) & sound
         graph.reach_margin[_widened(~found.achieved) | strained] += _REACH_STEP
         graph.rest_arm(strained, _LESS)
@@ -258,12 +259,12 @@ class _Adaptation:
         state, problem = found.state, graph.problem
         energies = energies_over_time(graph, state, self.config.schedule[-1])
         out = []
-        for number, ((s, d), slower, joints) in enumerate(zip(self.each(), self.slower, found.joints, strict=True)):
+        for number, ((s, d), joints) in enumerate(zip(self.each(), found.joints, strict=True)):
             if joints is not None and not at_ease(joints).all():
                 joints = self.joints(state, number, thorough=True)
-            times = d.times_s[0] + slower * (d.times_s - d.times_s[0])
-            if self.config.slow_down:
-                times = retimed(self.motion(state, s, joints), times, _SLOWEST)
+            times = d.times_s
+            if self.config.slow_down:  # the graph may have needed more time than its result
+                times = retimed(self.motion(state, s, joints), d.times_s, _SLOWEST)
             grasp = problem.grasps(problem.grasp, np.array([s.start]))[0][0]
             costs = {kind: values[s] for kind, values in energies.items()}
             tool, base, torso = state.gripper[s], state.base[s], state.torso[s]

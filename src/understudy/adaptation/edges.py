@@ -59,7 +59,8 @@ def between_postures(
     seen = [lie.se3_inverse(lie.se2_to_se3(base)) @ T for T, base in ((a, base_a), (b, base_b))]
     e, J_a, J_b = between_poses(*seen)
     # moving the base by Exp(d) moves the tool, seen from the base, by Exp(-d) on the left
-    K_a, K_b = (-(J @ lie.se3_adjoint(lie.se3_inverse(T)))[..., [0, 1, 5]] for J, T in zip((J_a, J_b), seen, strict=True))
+    turned = [lie.se3_adjoint(lie.se3_inverse(T))[..., [0, 1, 5]] for T in seen]
+    K_a, K_b = -(J_a @ turned[0]), -(J_b @ turned[1])
     return e, (J_a, K_a), (J_b, K_b)
 
 
