@@ -122,6 +122,32 @@ def test_another_start_is_tried_where_the_first_leads_nowhere(monkeypatch: pytes
     assert all(a.collision_free.all() and a.achievable.all() for a in second.demonstrations)
 
 
+def test_a_result_that_hits_nothing_is_better_than_one_with_less_out_of_reach() -> None:
+    good, one = np.ones(9, bool), np.arange(9) != 4
+    state = State(np.tile(np.eye(4), (9, 1, 1)), np.zeros((9, 3)), np.zeros(9), np.eye(4))
+    hits = Checked(state, one, good, good, (None,), (9,))
+    short = Checked(state, good, good, one & (np.arange(9) != 5), (None,), (9,))
+    assert short.failures < hits.failures
+    assert Checked(state, good, good, one, (None,), (9,)).failures < short.failures
+
+
+def test_an_arm_that_follows_no_hand_keeps_its_posture() -> None:
+    """The hand is not seen after the release, while the teacher walks away with the torso alone."""
+    d = scenes.demonstration("drawer", samples=60)
+    hidden = np.arange(len(d)) >= d.segments.release
+    T = d.hand.T_world_x.copy()
+    T[hidden] = np.nan
+    hand = replace(d.hand, T_world_x=T, observed=d.hand.observed & ~hidden, oriented=d.hand.oriented & ~hidden)
+    away = np.cumsum(np.where(hidden[:, None], [-0.05, 0.03, 0.0], 0.0), axis=0)
+    torso = replace(d.torso, xy_yaw=d.torso.xy_yaw + away)
+    a = adapt([replace(d, hand=hand, torso=torso)], scenes.platform(0.005)).demonstrations[0]
+    after = slice(d.segments.release + 1, None)
+    seen = lie.se3_inverse(lie.se2_to_se3(a.base[after])) @ a.T_world_tool[after]
+    gone = np.linalg.norm(a.base[-1, :2] - a.base[after][0, :2])
+    assert gone > 0.15
+    assert np.linalg.norm(np.ptp(seen[:, :3, 3], axis=0)) < 0.5 * gone
+
+
 def test_no_outlier_is_followed(room_door: tuple[list[Demonstration], AdaptationResult]) -> None:
     _, result = room_door
     clean = scenes.demonstrations("room_door", 3, scenes.Noise(hand=(0.0, 0.0), torso=(0.0, 0.0)), samples=60)

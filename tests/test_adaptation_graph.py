@@ -59,6 +59,11 @@ def test_smoothness_edges() -> None:
     _, Ja, Jb = edges.between_planar(p, q)
     _check(lambda d: edges.between_planar(lie.se2_compose(p, lie.se2_exp(d)), q)[0], Ja, 3)
     _check(lambda d: edges.between_planar(p, lie.se2_compose(q, lie.se2_exp(d)))[0], Jb, 3)
+    _, (Ja, Ka), (Jb, Kb) = edges.between_postures(a, p, b, q)
+    _check(lambda d: edges.between_postures(a @ lie.se3_exp(d), p, b, q)[0], Ja, 6)
+    _check(lambda d: edges.between_postures(a, p, b @ lie.se3_exp(d), q)[0], Jb, 6)
+    _check(lambda d: edges.between_postures(a, lie.se2_compose(p, lie.se2_exp(d)), b, q)[0], Ka, 3)
+    _check(lambda d: edges.between_postures(a, p, b, lie.se2_compose(q, lie.se2_exp(d)))[0], Kb, 3)
 
 
 def test_rigid_grasp_edge() -> None:

@@ -14,6 +14,7 @@ from understudy.demonstration import clock, storage
 from understudy.demonstration.alignment import align, on_floor, phase
 from understudy.demonstration.demonstration import FREE, OCCUPIED, UNKNOWN, Demonstration, Segments
 from understudy.demonstration.known_motion import part_points
+from understudy.demonstration.object_track import untouched
 from understudy.demonstration.scene_map import RESOLUTION, Sweep, View, occupancy, static_scene
 from understudy.demonstration.segments import MOVING, find_segments, measure_motion
 from understudy.errors import RecordingError, UnderstudyError
@@ -295,6 +296,42 @@ def test_the_part_whose_motion_is_known_is_found_and_the_hand_at_it_is_not():
     assert np.ptp(part[:, 1]) > 0.6
     nobody = part_points(views, T, np.full((len(way), 4, 4), np.nan))
     assert nobody.shape == (0, 3)
+
+
+def test_a_door_that_was_opened_once_is_no_wall():
+    """A gate is pushed back and stays there, where nobody could look before: it is the part, not what stands still."""
+    T, still = looking(), np.zeros((0, 18, 3))
+    way = np.array([0.0, 0.0, 0.0, 0.7, 0.7, 0.7, 0.7, 0.7])
+    T_part = np.tile(np.eye(4), (len(way), 1, 1))
+    T_part[:, 0, 3] = 2.4 + way
+    gates = [(np.array([2.4 + q, -0.4, 0.3]), np.array([2.42 + q, 0.4, 1.2])) for q in way]
+    post = (np.array([2.4, 0.5, 0.0]), np.array([2.5, 0.7, 1.2]))
+    views = [View(cast(T, [gate, post]), still) for gate in gates]
+    part = part_points(views, T, T_part)
+    assert len(part) > 100
+    assert (np.abs(part[:, 0]) < 0.05).all()
+    assert (np.abs(part[:, 1]) < 0.45).all(), "the post does not go with the gate"
+    assert np.ptp(part[:, 1]) > 0.7 and np.ptp(part[:, 2]) > 0.8
+
+
+def test_a_part_that_no_hand_has_reached_is_at_rest():
+    """The object is hidden from sample 5 to 20; the hand is seen at it at sample 12 and pulls it out from there on."""
+    t, x = 30, np.concatenate([np.zeros(12), np.linspace(0, 0.5, 18)])
+    T = np.tile(np.eye(4), (t, 1, 1))
+    T[:, 0, 3] = x
+    hand = T.copy()
+    hand[:, 1, 3] = np.maximum(12 - np.arange(t), 0) * 0.1
+    seen = (np.arange(t) < 5) | (np.arange(t) >= 20)
+    T[~seen] = np.nan
+    covariance, every = np.tile(1e-6 * np.eye(6), (t, 1, 1)), np.ones(t, bool)
+    covariance[~seen] = np.nan
+    object = PoseTrack(T, covariance, seen, seen.copy())
+    filled = untouched(object, PoseTrack(hand, np.tile(1e-4 * np.eye(6), (t, 1, 1)), every, every))
+    assert filled.known[:10].all() and not filled.known[10:20].any()  # within reach from sample 10 on
+    np.testing.assert_array_equal(filled.T_world_x[5:10], np.tile(np.eye(4), (5, 1, 1)))
+    np.testing.assert_array_equal(filled.observed, seen)
+    hidden = PoseTrack(np.full_like(hand, np.nan), covariance, ~every, ~every)
+    np.testing.assert_array_equal(untouched(object, hidden).known, seen)
 
 
 def test_an_empty_recording_has_an_empty_map():

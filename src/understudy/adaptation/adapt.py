@@ -43,6 +43,8 @@ _REACH_STEP: Final = 0.015  # metres by which margins are tightened
 _OBSTACLE_STEP: Final = 0.01
 _STARTS: Final = 4  # that the graph is solved from, while exact checks fail
 _EASED: Final = 6  # rounds for the sake of the arm's motion alone
+_PATIENCE: Final = 4  # rounds without anything better
+_LESS: Final = 0.5  # factor on how much a hand is followed where the arm is not at ease
 _STIFFER: Final = 1.5  # factor on the map's edges where the base is not clear of it
 _MOST_OBSTACLE: Final = 0.02  # in all: more would close doorways
 
@@ -124,7 +126,7 @@ class _Adaptation:
             if self.settled(every[-1].found):
                 break
         best = min(every, key=lambda one: one.rank)
-        graph, found, self.slower = best.graph, best.found, best.slower
+        graph, found = best.graph, best.found
         self.refuse(graph, found)
         if not best.convergence.converged:
             self.notes.append("the solver stopped at its limit of iterations")
@@ -147,7 +149,7 @@ class _Adaptation:
                 graph.with_grasp(start.family.nearest(state.grasp))
         found, rounds, part, converged = self.tighten(graph, state, converged)
         convergence = Convergence((*course, *part), converged, *watch.read())
-        return Attempt(start, graph, found, self.slower, rounds, convergence)
+        return Attempt(start, graph, found, rounds, convergence)
 
     def settled(self, found: Checked) -> bool:
         """Nothing is left that another start could mend."""
@@ -169,30 +171,37 @@ class _Adaptation:
         only the arm is not at ease, a few times: an arm that is not stretched has choices.
         """
         course: list[Iteration] = []
-        eased = 0
-        stage, every = self.config.schedule[-1], list[tuple[Checked, Problem, np.ndarray]]()
-        for round in range(self.config.rounds):
+        stage, every = self.config.schedule[-1], list[tuple[Checked, Problem, tuple[float, ...]]]()
+        tightened = eased = best = 0
+        while True:
             found = self.checked(state)
             sound = self.settled(found)
             found = self.eased(found) if sound else found
             late = self.late(graph, found)
-            every.append((found, graph.problem, self.slower))
-            if sound and (late == 1).all() and (found.arm.all() or eased >= _EASED):
+            off = float(graph.missed(found.state).max())
+            every.append((found, graph.problem, (off > LOOSE, *found.failures, off > _EXACT)))
+            best = min(best, len(every) - 1, key=lambda i: every[i][2])
+            done = eased >= _EASED or found.arm.all() if sound else tightened >= self.config.rounds
+            if (done and (not sound or (late == 1).all())) or len(every) - 1 - best >= _PATIENCE:
                 break
-            eased += sound
+            eased, tightened = eased + sound, tightened + (not sound)
             self.slower = self.slower * late
             graph.stretch(self.per_step(late))
-            graph.reach_margin[_widened(~(found.achieved & (found.arm | (not sound))))] += _REACH_STEP
-            graph.map_stiffness[_widened(~found.free)] *= _STIFFER
-            graph.part_stiffness[_widened(~found.beside)] *= _STIFFER
-            if not found.free.all() and graph.obstacle_margin < self.config.margins.obstacle + _MOST_OBSTACLE:
-                graph.obstacle_margin += _OBSTACLE_STEP
-            state, part, converged = _solve(graph, state, stage, len(self.config.schedule) + round)
+            self.harder(graph, found, sound)
+            state, part, converged = _solve(graph, state, stage, len(self.config.schedule) + len(every) - 1)
             course += part
-        else:
-            every.append((self.checked(state), graph.problem, self.slower))
-        found, graph.problem, self.slower = min(every, key=lambda one: one[0].failures)
+        found, graph.problem, _ = every[best]
         return found, len(every) - 1, course, converged
+
+    def harder(self, graph: Graph, found: Checked, sound: bool) -> None:
+        """Larger margins, stiffer edges around what fails; where only the arm does (sound), less of the hand, too."""
+        strained = _widened(~found.arm) & sound
+        graph.reach_margin[_widened(~found.achieved) | strained] += _REACH_STEP
+        graph.rest_arm(strained, _LESS)
+        graph.map_stiffness[_widened(~found.free)] *= _STIFFER
+        graph.part_stiffness[_widened(~found.beside)] *= _STIFFER
+        if not found.free.all() and graph.obstacle_margin < self.config.margins.obstacle + _MOST_OBSTACLE:
+            graph.obstacle_margin += _OBSTACLE_STEP
 
     def eased(self, found: Checked) -> Checked:
         """The same with a thorough search for joints where the arm is not at ease yet."""
@@ -250,12 +259,12 @@ class _Adaptation:
         state, problem = found.state, graph.problem
         energies = energies_over_time(graph, state, self.config.schedule[-1])
         out = []
-        for number, ((s, d), slower, joints) in enumerate(zip(self.each(), self.slower, found.joints, strict=True)):
+        for number, ((s, d), joints) in enumerate(zip(self.each(), found.joints, strict=True)):
             if joints is not None and not at_ease(joints).all():
                 joints = self.joints(state, number, thorough=True)
-            times = d.times_s[0] + slower * (d.times_s - d.times_s[0])
-            if self.config.slow_down:
-                times = retimed(self.motion(state, s, joints), times, _SLOWEST)
+            times = d.times_s
+            if self.config.slow_down:  # the graph may have needed more time than its result
+                times = retimed(self.motion(state, s, joints), d.times_s, _SLOWEST)
             grasp = problem.grasps(problem.grasp, np.array([s.start]))[0][0]
             costs = {kind: values[s] for kind, values in energies.items()}
             tool, base, torso = state.gripper[s], state.base[s], state.torso[s]

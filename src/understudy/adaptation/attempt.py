@@ -5,9 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
-import numpy as np
-from jaxtyping import Float
-
 from understudy.adaptation.checks import Checked
 from understudy.adaptation.graph import Graph
 from understudy.adaptation.solver import Convergence
@@ -24,12 +21,10 @@ class Attempt:
     start: Start
     graph: Graph
     found: Checked
-    slower: Float[np.ndarray, " d"]
-    """times the demonstrations' clocks"""
     rounds: int
     convergence: Convergence
 
     @property
-    def rank(self) -> tuple[bool, int, int]:
-        """The least is best: a grasp that is none; then samples that fail."""
+    def rank(self) -> tuple[bool, bool, int, int]:
+        """The least is best: a grasp that is none; then what fails."""
         return float(self.graph.missed(self.found.state).max()) > LOOSE, *self.found.failures

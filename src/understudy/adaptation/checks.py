@@ -41,11 +41,11 @@ class Checked:
         return np.concatenate([np.ones(n, bool) if j is None else at_ease(j) for j, n in parts])
 
     @property
-    def failures(self) -> tuple[int, int]:
-        """Samples at which something fails that must not; and at which the base is where the part is, or the arm is not
-        at its ease.
+    def failures(self) -> tuple[bool, int, int]:
+        """The least is best: whether the base hits what stands still, which is always refused; samples at which it hits
+        something or the pose is out of reach; and at which the arm is not at its ease.
         """
-        return int((~(self.free & self.achieved)).sum()), int((~(self.beside & self.arm)).sum())
+        return not self.free.all(), int((~(self.clear & self.achieved)).sum()), int((~self.arm).sum())
 
 
 def at_ease(path: JointPath) -> Bool[np.ndarray, " t"]:

@@ -45,6 +45,25 @@ def between_poses(
     return e, -lie.se3_left_jacobian_inverse(e), lie.se3_left_jacobian_inverse(-e)
 
 
+def between_postures(
+    a: Float[np.ndarray, "n 4 4"],
+    base_a: Float[np.ndarray, "n 3"],
+    b: Float[np.ndarray, "n 4 4"],
+    base_b: Float[np.ndarray, "n 3"],
+) -> tuple[
+    Float[np.ndarray, "n 6"],
+    tuple[Float[np.ndarray, "n 6 6"], Float[np.ndarray, "n 6 3"]],
+    tuple[Float[np.ndarray, "n 6 6"], Float[np.ndarray, "n 6 3"]],
+]:
+    """How the gripper moves as seen from the base: between_poses of B^-1 T, and Jacobians over (T, base) of a and b."""
+    seen = [lie.se3_inverse(lie.se2_to_se3(base)) @ T for T, base in ((a, base_a), (b, base_b))]
+    e, J_a, J_b = between_poses(*seen)
+    # moving the base by Exp(d) moves the tool, seen from the base, by Exp(-d) on the left
+    turned = [lie.se3_adjoint(lie.se3_inverse(T))[..., [0, 1, 5]] for T in seen]
+    K_a, K_b = -(J_a @ turned[0]), -(J_b @ turned[1])
+    return e, (J_a, K_a), (J_b, K_b)
+
+
 def between_planar(
     a: Float[np.ndarray, "n 3"], b: Float[np.ndarray, "n 3"]
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3 3"], Float[np.ndarray, "n 3 3"]]:

@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import Final
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from understudy.adaptation import edges
 from understudy.adaptation.clock import base_motion, gripper_motion, joined
@@ -50,7 +50,7 @@ class Graph:
         self.weights, self.margins, self.limits = weights or Weights(), margins or Margins(), limits or Limits()
         self.reach_margin = np.full(len(problem.dt), self.margins.reach)
         self.obstacle_margin = self.margins.obstacle
-        self.map_stiffness, self.part_stiffness = np.ones((2, len(problem.dt)))
+        self.map_stiffness, self.part_stiffness, self.following = np.ones((3, len(problem.dt)))
         self._inradius = max(float(half_planes(platform.footprint)[1].min()), 0.0)
         self._hand = np.flatnonzero(np.isfinite(problem.hand).all(axis=(1, 2)))
         self._torso = np.flatnonzero(np.isfinite(problem.torso).all(axis=1))
@@ -60,6 +60,8 @@ class Graph:
         t = np.array([w.torso[0], w.torso[0], w.torso[1]]) ** 2
         self._torso_root = inverse_root(problem.torso_covariance[self._torso], np.tile(t, (len(self._torso), 1)))
         self._pairs = np.flatnonzero(np.isfinite(problem.dt))
+        free = np.isnan(problem.hand).any(axis=(1, 2)) & ~problem.holding
+        self.resting = free
         linked = np.isfinite(problem.dt)
         self._triples = np.flatnonzero(linked[:-1] & linked[1:])
         self._holding = np.flatnonzero(problem.holding)
@@ -73,6 +75,12 @@ class Graph:
     def stretch(self, factor: Float[np.ndarray, " n"]) -> None:
         """Slows the clock down, per step."""
         self.problem = replace(self.problem, dt=factor * self.problem.dt)
+
+    def rest_arm(self, steps: Bool[np.ndarray, " n"], share: float) -> None:
+        """Where the part is not held: follow the hand less (times `share`), keep the arm's posture instead."""
+        steps = steps & ~self.problem.holding
+        self.following[steps] *= share
+        self.resting = self.resting | steps
 
     def excess(self, state: State) -> Float[np.ndarray, " d"]:
         """Greatest velocity or acceleration of base, torso and gripper over its limit, per demonstration: 1 is just
@@ -108,7 +116,8 @@ class Graph:
         """Follow hand and torso; the torso's lift rests in the middle of its range."""
         p, w = self.problem, self.weights
         e, J = edges.follow_pose(p.hand[self._hand], state.gripper[self._hand])
-        hand = weighted("hand", self._hand, e, [(0, GRIPPER, J)], self._hand_root, stage.kernel, w.kernel_width)
+        root = self.following[self._hand, None, None] * self._hand_root
+        hand = weighted("hand", self._hand, e, [(0, GRIPPER, J)], root, stage.kernel, w.kernel_width)
         e, J = edges.follow_planar(p.torso[self._torso], state.base[self._torso])
         torso = weighted("torso", self._torso, e, [(0, BASE, J)], self._torso_root, stage.kernel, w.kernel_width)
         n = len(state.torso)
@@ -160,7 +169,21 @@ class Graph:
         out.append(limited(a, u, base, -top, top, limit))
         top = np.array([share * self.platform.torso_velocity])
         out.append(limited(a, lift, torso, -top, top, limit[:1]))
-        return [*out, *self._accelerations((v, Ja, Jb), (u, Ka, Kb), limit)]
+        return [*out, *self._resting(state), *self._accelerations((v, Ja, Jb), (u, Ka, Kb), limit)]
+
+    def _resting(self, state: State) -> list[Linear]:
+        """Where no hand is followed the arm keeps its posture."""
+        a = self._pairs[self.resting[self._pairs] & self.resting[self._pairs + 1]]
+        if not len(a):
+            return []
+        b, dt = a + 1, self.problem.dt[a, None]
+        e, before, after = edges.between_postures(state.gripper[a], state.base[a], state.gripper[b], state.base[b])
+        parts = [
+            (step, columns, J / dt[..., None])
+            for step, both in enumerate((before, after))
+            for columns, J in zip((GRIPPER, BASE), both, strict=True)
+        ]
+        return [scaled("posture", a, e / dt, parts, six(self.weights.posture))]
 
     def _accelerations(self, gripper: Rates, base: Rates, limit: np.ndarray) -> list[Linear]:
         w, dt = self.weights, self.problem.dt

@@ -92,7 +92,7 @@ def _above(axes: Axes, d: Demonstration, a: Adapted, result: AdaptationResult, r
     low, high = everything.min(axis=0) - _AROUND_M, everything.max(axis=0) + _AROUND_M
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), xlabel="x, m", ylabel="y, m", aspect="equal")
     axes.set_title("from above (grey: not known; dark: occupied)", fontsize=10)
-    axes.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.08), ncols=3, frameon=False)
+    axes.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=3, frameon=False)
 
 
 def _map(axes: Axes, map: OccupancyMap) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 class Weights:
     """Standard deviations (or, of limits, what a violation may cost): small is stiff. Pairs: metres, radians."""
 
-    hand: tuple[float, float] = (0.03, np.radians(10))
+    hand: tuple[float, float] = (0.01, np.radians(10))
     """following while reaching, besides the observation's own covariance"""
     hand_holding: tuple[float, float] = (0.15, np.radians(40))
     """the same while manipulating, where the object says where the gripper must be"""
@@ -25,6 +25,8 @@ class Weights:
     """metres/s, radians/s"""
     gripper_acceleration: tuple[float, float] | None = (2.0, 6.0)
     """metres/s^2, radians/s^2; None: no such edges"""
+    posture: tuple[float, float] = (0.2, 0.5)
+    """metres/s, radians/s of the gripper as seen from the base, where no hand was observed: the arm rests"""
     base_speed: tuple[float, float] = (0.5, 1.0)
     base_acceleration: tuple[float, float] | None = (0.5, 1.0)
     torso_speed: float = 0.01

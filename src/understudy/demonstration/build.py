@@ -17,7 +17,7 @@ from understudy.demonstration.actor import Candidate, reaching_hands
 from understudy.demonstration.body_tracks import hand_track, hold, on_the_floor, torso_track
 from understudy.demonstration.demonstration import Demonstration
 from understudy.demonstration.known_motion import part_points
-from understudy.demonstration.object_track import ObjectTrack, by_depth, by_markers
+from understudy.demonstration.object_track import ObjectTrack, by_depth, by_markers, untouched
 from understudy.demonstration.scene_map import Sweep, View, occupancy, static_scene
 from understudy.demonstration.segments import MOVING, find_segments, measure_motion
 from understudy.errors import UnderstudyError, one_of
@@ -104,6 +104,7 @@ def build(
     else:
         hand = clock.resample_poses(body.hand(actor), actor.track.times_s, even)
         torso = clock.resample_planar(torso_track(actor.track, T_world_cam), actor.track.times_s, even)
+    object = untouched(object, hand)
     sure = hand.observed & (np.sqrt(np.trace(hand.covariance[:, :3, :3], axis1=1, axis2=2)) < _SURE_M)
     apart = np.where(sure, np.linalg.norm(hand.positions - object.positions, axis=1), np.nan)
     segments = find_segments(even, _way(thing.articulation, object), apart)

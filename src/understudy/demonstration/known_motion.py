@@ -14,7 +14,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from understudy.demonstration.scene_map import VOXEL, View, Votes, stays, votes, without_specks
+from understudy.demonstration.scene_map import VOXEL, View, Votes, seen_through, stays, votes, without_specks
 from understudy.geometry import inverse, transform_points
 
 _MOVED: Final = 2.5 * VOXEL  # metres of a place from where it was at rest: enough to tell it from what stands still
@@ -30,8 +30,10 @@ def part_points(
     """Points of the part in its own frame, one for each voxel.
 
     T_world_part: at each view, NaN where it is not known; the first that is known is where it rests. A place belongs to
-    the part when most looks at it found a surface, also most of those after it had moved, and when that was not where
-    something stands still: a front that slides along its own plane looks the same from both, and is left out.
+    the part when most looks at it found a surface, also most of those after it had moved, and when nothing that stands
+    still explains that: it was found where nothing does, or where it rested the view is open since. (A door that was
+    opened once stands still like a wall, where nobody could look before; but it is not where it was.) Of a front
+    that slides along its own plane, what covers its old place looks the same from both, and is left out.
     """
     known = np.isfinite(T_world_part).all(axis=(1, 2))
     T = T_world_part[known]
@@ -45,8 +47,22 @@ def part_points(
     world = votes(views, np.broadcast_to(T_world_cam, (len(views), 4, 4)))
     left = found & ~_beside(world.center[world.stays], places)
     own = seen.stays & stays(found, seen.through & moved)
-    own &= (found.sum(axis=1) >= _LOOKS) & (left.sum(axis=1) >= _LEFT * found.sum(axis=1))
+    elsewhere = left.sum(axis=1) >= _LEFT * found.sum(axis=1)
+    own &= (found.sum(axis=1) >= _LOOKS) & (elsewhere | _gone(looks, T_world_cam, seen.hit, places[:, 0], moved))
     return _largest(without_specks(seen.center[own]))
+
+
+def _gone(
+    looks: Sequence[View],
+    T_world_cam: Float[np.ndarray, "4 4"],
+    hit: Bool[np.ndarray, "n k"],
+    rest: Float[np.ndarray, "n 3"],
+    moved: Bool[np.ndarray, "n k"],
+) -> Bool[np.ndarray, " n"]:
+    """Which of n places were found at rest (`rest`: there, world), where looks went through when they had moved."""
+    own = transform_points(inverse(T_world_cam), rest)
+    through = np.stack([seen_through(view.depth, own) for view in looks], axis=1)
+    return np.asarray((hit & ~moved).any(axis=1) & ((through & moved).sum(axis=1) >= _LOOKS))
 
 
 def _largest(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:

@@ -21,6 +21,8 @@ USUAL_HANDLE: Final = Handle(length_m=0.12, radius_m=0.008, standoff_m=0.035)
 """Of an object that is followed by markers, which say nothing about its shape."""
 
 _LEAST_SEEN = 8  # samples
+_AWAY = 0.25  # metres of a hand from the handle: it does not hold it
+_MOVED = 0.03  # metres of the handle from where it rested
 _ROUGH = 1e-6  # of a covariance, relative: keeps it invertible
 
 
@@ -76,6 +78,27 @@ def by_markers(measured: PoseTrack) -> ObjectTrack:
     return ObjectTrack(
         PoseTrack(T, covariance, observed, observed.copy()), articulation, USUAL_HANDLE, np.zeros((0, 3)), len(keep)
     )
+
+
+def untouched(object: PoseTrack, hand: PoseTrack) -> PoseTrack:
+    """The object's track with its pose at rest where it was not seen before the hand came to it: nothing else moves it.
+
+    Up to the last sample at which a hand was seen away from it, before one is seen at it or the object has moved.
+    """
+    known = object.known
+    if not known.any():
+        return object
+    first = int(np.argmax(known))
+    rest = object.T_world_x[first]
+    away = np.linalg.norm(hand.positions - rest[:3, 3], axis=1) > _AWAY
+    moved = known & (np.linalg.norm(object.positions - rest[:3, 3], axis=1) > _MOVED)
+    touched = np.logical_or.accumulate(moved | (hand.observed & ~away))
+    still = np.flatnonzero(hand.observed & away & ~touched)
+    last = int(still[-1]) if len(still) else -1
+    fill = ~known & (np.arange(len(known)) <= last)
+    T, covariance = object.T_world_x.copy(), object.covariance.copy()
+    T[fill], covariance[fill] = rest, object.covariance[first]
+    return PoseTrack(T, covariance, object.observed, object.oriented)
 
 
 def _along(

@@ -114,7 +114,7 @@ def votes(views: Sequence[View], T_frame_cam: Float[np.ndarray, "k 4 4"]) -> Vot
     hit = np.zeros((len(center), len(views)), bool)
     hit[which, look] = True
     through = [
-        _seen_through(view.depth, transform_points(inverse(T), center))
+        seen_through(view.depth, transform_points(inverse(T), center))
         for view, T in zip(views, T_frame_cam, strict=True)
     ]
     return Votes(center, hit, np.stack(through, axis=1))
@@ -202,7 +202,7 @@ def _distance_to_bones(points: Float32[np.ndarray, "n 3"], ends: Float32[np.ndar
     return best
 
 
-def _seen_through(depth: RegisteredDepth, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+def seen_through(depth: RegisteredDepth, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
     """Which points (camera's frame) lie clearly in front of what was measured in their pixel."""
     z = points[:, 2]
     uv = depth.camera.project(points)
