@@ -9,6 +9,7 @@ Metres.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from typing import Final
 
 import cv2
@@ -47,6 +48,7 @@ SIGMA: Final = 0.06
 UNSURE: Final = ("wrist", "elbow")
 """Joints of whose uncertainty the network is told"""
 
+_KNOTS = 13  # in a row, at which it is projected
 _SHARPEST = 4  # times as fine as the colour crop at most: where it is averaged from
 _NEAREST_Z = 0.1  # metres: nothing nearer to the camera is measured
 
@@ -110,7 +112,7 @@ class HandView:
 
         points: what the camera measured, colour camera's frame. `CELLS` columns across `2 * HALF` at the centre.
         """
-        x, y, z = np.einsum("ij,nj->in", self.R, points)
+        x, y, z = self.R @ points.T
         depth = z - self.distance
         with np.errstate(divide="ignore", invalid="ignore"):
             scale = self.distance / CELL / z
@@ -126,11 +128,12 @@ class HandView:
         GREY outside the image. camera: of the image.
         """
         finer = int(np.clip(round(PIXEL * camera.fx / self.distance), 1, _SHARPEST))
-        offset = (np.arange(PIXELS) + 0.5 - PIXELS / 2) * PIXEL / self.distance
-        x, y = np.meshgrid(offset, offset)
+        knots = np.linspace(-HALF, HALF, _KNOTS) / self.distance
+        x, y = np.meshgrid(knots, knots)
         rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3) @ self.R
-        uv = np.nan_to_num(camera.project(rays), nan=-1e4).astype(np.float32).reshape(PIXELS, PIXELS, 2)
-        u, v = cv2.split(cv2.resize(uv, None, fx=finer, fy=finer, interpolation=cv2.INTER_LINEAR))
+        uv = np.nan_to_num(camera.project(rays), nan=-1e4).reshape(_KNOTS, _KNOTS, 2)
+        fill = _between(finer * PIXELS)
+        u, v = ((fill @ uv[..., i] @ fill.T).astype(np.float32) for i in range(2))
         grey = (GREY, GREY, GREY)
         seen = cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=grey)
         small: np.ndarray = cv2.resize(seen, (PIXELS, PIXELS), interpolation=cv2.INTER_AREA)
@@ -147,6 +150,13 @@ class HandView:
         measured = z > 0
         chosen = z[measured].astype(np.float64)
         return np.stack([rays[0][measured] * chosen, rays[1][measured] * chosen, chosen], axis=1)
+
+
+@cache
+def _between(n: int) -> Float[np.ndarray, "n k"]:
+    """Linear interpolation between the knots at the centres of n pixels."""
+    at = (np.arange(n) + 0.5) * (_KNOTS - 1) / n
+    return np.maximum(1 - np.abs(at[:, None] - np.arange(_KNOTS)), 0.0)
 
 
 def arm_context(joints: Float[np.ndarray, "18 3"], side: str) -> Float[np.ndarray, "7 3"]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
@@ -24,8 +24,6 @@ from understudy.voxels import rotation_to
 
 LEAST_CONFIDENCE: Final = 0.18
 """Palms below are left out."""
-ASK: Final = 0.8
-"""Palms below, of wrists that are seen, are looked for by the colour path, too."""
 
 _BALL = 1.87  # radius that holds 68 % of a normal distribution in space, in sigmas along an axis
 _SIGMA_LEAST, _SIGMA_MOST = 0.03, 0.12  # metres along an axis: of wrists that are looked for in several places
@@ -43,10 +41,10 @@ class HandNormalEstimator:
     1. `HandView`: where the body says that a hand is, how large and how turned; left or right is the body's word.
     2. `HandView.depth_crop`, `color_crop`: depth and colour around the hand; several crops, as far apart as the wrist
        is uncertain.
-    3. `HandPredictor`: a network that is told both, and the body's joints, trained to weigh them; where the fingers
+    3. `ColorPath`: where the wrist is seen, palm detection and hand landmarks on larger crops of the colour image
+       (optional).
+    4. `HandPredictor`: a network that is told all this, and the body's joints, trained to weigh it; where the fingers
        cannot be seen, what the forearm and the posture make likely is left. `pooled` joins what it says of the crops.
-    4. `ColorPath`: where that is less sure than `ASK`, and the wrist is seen, palm detection and hand landmarks on
-       larger crops of the colour image; the network is asked again, with their word (optional).
     """
 
     def __init__(
@@ -80,14 +78,13 @@ class HandNormalEstimator:
         """The hands of several people of one frame."""
         registered = frame if isinstance(frame, RegisteredFrame) else register(frame)
         places = [self._views(registered.camera, person) for person in people]
+        seen = [self._color_palms(registered, person, views) for person, (views, _) in zip(people, places, strict=True)]
         hands = [
-            _Hand(i, side, several, *_crops(registered, several, self.color))
+            _Hand(i, side, several, *_crops(registered, several, self.color), seen[i].get(side))
             for i, (views, _) in enumerate(places)
             for side, several in views.items()
         ]
         words = self._predict(hands)
-        if self.color_path is not None:
-            self._ask_color(self.color_path, registered, people, hands, words)
         palms: list[dict[str, Palm]] = [{} for _ in people]
         for hand, word in zip(hands, words, strict=True):
             if word.confidence < self.least_confidence:
@@ -97,34 +94,13 @@ class HandNormalEstimator:
                 palms[hand.person][hand.side] = hand.palm(registered.camera, word)
         return [Hands(p.get("left"), p.get("right"), why) for p, (_, why) in zip(palms, places, strict=True)]
 
-    def _ask_color(
-        self,
-        path: ColorPath,
-        frame: RegisteredFrame,
-        people: Sequence[Person],
-        hands: list[_Hand],
-        words: list[HandPrediction],
-    ) -> None:
-        """Where a hand that can be seen is not known well: what the network says with the colour path's word, in place.
-
-        Hands that it finds carry it then.
-        """
-        found: list[int] = []
-        for number, person in enumerate(people):
-            unsure = {
-                hand.side: i
-                for i, hand in enumerate(hands)
-                if hand.person == number
-                and words[i].confidence < ASK
-                and person.source[JOINT[f"{hand.side}_wrist"]] == OBSERVED
-            }
-            if unsure:
-                for side, palm in path.estimate(frame, person, list(unsure)).items():
-                    if palm is not None:
-                        hands[unsure[side]] = replace(hands[unsure[side]], color=palm)
-                        found.append(unsure[side])
-        for i, word in zip(found, self._predict([hands[i] for i in found]), strict=True):
-            words[i] = word
+    def _color_palms(
+        self, frame: RegisteredFrame, person: Person, views: dict[str, list[HandView]]
+    ) -> dict[str, ColorPalm | None]:
+        if self.color_path is None or not views:
+            return {}
+        seen = [side for side in views if person.source[JOINT[f"{side}_wrist"]] == OBSERVED]
+        return self.color_path.estimate(frame, person, seen)
 
     def _predict(self, hands: Sequence[_Hand]) -> list[HandPrediction]:
         """Of each hand, from all its views."""
@@ -196,8 +172,8 @@ class _Hand:
     views: list[HandView]
     crops: Float32[np.ndarray, "n 2 48 48"]
     images: UInt8[np.ndarray, "n 72 72 3"]
-    color: ColorPalm | None = None
-    """what the colour path says, where it was asked and found the palm"""
+    color: ColorPalm | None
+    """what the colour path says, where it found the palm"""
 
     def palm(self, camera: Camera, word: HandPrediction) -> Palm:
         """The result, from the pooled prediction."""
