@@ -13,7 +13,20 @@ from understudy.estimator import Estimator
 from understudy.hands import HandNormalEstimator
 from understudy.hands import estimator as hands_module
 from understudy.hands.color_path import ColorPalm
-from understudy.hands.crop import CELL, CELLS, EMPTY, HALF, LIMIT, HandView, arm_context, crop_rotation
+from understudy.hands.crop import (
+    CELL,
+    CELLS,
+    EMPTY,
+    GREY,
+    HALF,
+    LIMIT,
+    PIXEL,
+    PIXELS,
+    SIGMA,
+    HandView,
+    arm_context,
+    crop_rotation,
+)
 from understudy.hands.estimator import hypotheses, supported
 from understudy.hands.predictor import HandPrediction, HandPredictor, color_word, pooled
 from understudy.skeleton import JOINT, N_JOINTS
@@ -107,6 +120,43 @@ def test_crop_needs_only_the_points_near() -> None:
     for seed in range(6):
         view = HandView.of(skeleton(seed) + [0.4 * (seed % 3 - 1), 0, 0], SIDES[seed % 2])
         np.testing.assert_allclose(view.depth_crop(view.points_near(depth)), view.depth_crop(everything), atol=1e-5)
+
+
+@pytest.mark.parametrize("side", SIDES)
+@pytest.mark.parametrize("focal", [280.0, 1400.0])
+def test_colour_crop_shows_what_lies_there(side: str, focal: float) -> None:
+    """Each pixel of the crop has the colour of the image where its place at the hand's distance is seen."""
+    camera = Camera(
+        1000, 800, np.array([[focal, 0, 499.5], [0, focal, 399.5], [0, 0, 1]]), "brown_conrady", (0.08, -0.1, 0, 0, 0)
+    )
+    v, u = np.mgrid[0:800, 0:1000]
+    image = np.stack([u / 4, v / 4, np.zeros_like(u)], -1).astype(np.uint8)
+    view = HandView.of(skeleton(5) * [0.3, 0.3, 1.0], side)
+    crop = view.color_crop(camera, image).astype(float)
+    steps = (np.arange(PIXELS) + 0.5) * PIXEL - HALF
+    x, y = np.meshgrid(steps, steps)
+    uv = camera.project(view.to_cam(np.stack([x, y, np.zeros_like(x)], -1).reshape(-1, 3))).reshape(PIXELS, PIXELS, 2)
+    inside = ((uv > 4) & (uv < [995, 795])).all(-1)
+    assert inside.mean() > 0.3
+    np.testing.assert_allclose(crop[..., :2][inside], uv[inside] / 4, atol=1.5)
+
+
+def test_colour_crop_is_grey_outside_the_image_and_mirrored_for_left_hands() -> None:
+    camera = Camera(320, 240, np.array([[280.0, 0, 159.5], [0, 280, 119.5], [0, 0, 1]]))
+    image = np.random.default_rng(0).integers(0, 255, (240, 320, 3)).astype(np.uint8)
+    joints = skeleton(4) * [0.3, 0.3, 1.0]
+    left, right = HandView.of(joints, "left"), HandView.of(mirrored_sides(joints) * MIRROR, "right")
+    apart = np.abs(left.color_crop(camera, image).astype(int) - right.color_crop(camera, image[:, ::-1].copy()))
+    assert (apart <= 1).all()
+    assert (HandView.of(joints + [9, 0, 0], "left").color_crop(camera, image) == GREY).all()
+
+
+def test_views_know_how_sure_the_arm_is() -> None:
+    sigma = np.full(N_JOINTS, 0.02)
+    sigma[JOINT["left_wrist"]], sigma[JOINT["left_elbow"]] = 0.3, np.nan
+    np.testing.assert_allclose(HandView.of(skeleton(), "left", sigma).sigma, [0.3, SIGMA])
+    np.testing.assert_allclose(HandView.of(skeleton(), "right", sigma).sigma, [0.02, 0.02])
+    np.testing.assert_allclose(HandView.of(skeleton(), "right").sigma, [SIGMA, SIGMA])
 
 
 def test_forearm_towards_the_camera_still_has_a_view() -> None:
@@ -223,7 +273,7 @@ def test_without_the_colour_networks_depth_is_used(monkeypatch: pytest.MonkeyPat
         raise ModelFileError("offline: run `understudy models fetch`")
 
     monkeypatch.setattr(hands_module, "load_nets", absent)
-    with pytest.warns(UserWarning, match="depth alone.*understudy models fetch"):
+    with pytest.warns(UserWarning, match="without the colour path.*understudy models fetch"):
         estimator = HandNormalEstimator()
     assert estimator.color_path is None
     assert estimator.estimate(frame_of(), person(skeleton(7) - [0.2, 0, 0])) is not None
@@ -248,10 +298,14 @@ def test_exported_network_says_what_torch_says() -> None:
     view = HandView.of(skeleton(), "right")
     depth = np.stack([view.depth_crop(cloud_around(view, seed=k)) for k in range(5)])
     color = rng.normal(0, 0.5, (5, 9)).astype(np.float32)
-    said = HandPredictor()([view] * 5, depth, color)
+    image = rng.integers(0, 256, (5, PIXELS, PIXELS, 3)).astype(np.uint8)
+    said = HandPredictor()([view] * 5, depth, color, image)
     context = torch.tensor(np.stack([view.context] * 5)).float()
     with torch.no_grad():
-        out = net.eval()(torch.tensor(depth), context, torch.full((5, 1), view.distance), torch.tensor(color))
+        picture, sigma = torch.tensor(image).permute(0, 3, 1, 2).float(), torch.tensor(np.stack([view.sigma] * 5))
+        out = net.eval()(
+            torch.tensor(depth), context, torch.full((5, 1), view.distance), torch.tensor(color), sigma.float(), picture
+        )
     for k, word in enumerate(said):
         np.testing.assert_allclose(view.directions_from_cam(word.normal), out.normal[k].numpy(), atol=1e-3)
         np.testing.assert_allclose((word.landmarks - view.center) @ view.R.T, out.landmarks[k].numpy(), atol=1e-3)

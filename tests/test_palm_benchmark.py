@@ -39,7 +39,7 @@ from understudy.benchmark.palms import (
 from understudy.camera import Camera, RGBDCamera
 from understudy.detectors.blazepose_nets import Region
 from understudy.errors import RecordingError, UnderstudyError
-from understudy.hands.crop import CELLS, EMPTY
+from understudy.hands.crop import CELLS, EMPTY, GREY, PIXELS
 from understudy.hands.nets import INDEX, PINKY, HandLandmarks, HandNets, load_nets
 from understudy.recordings import FolderRecording, write_recording
 from understudy.recordings import open as open_recording
@@ -296,13 +296,16 @@ def simulated_hands(n: int = 6) -> SimulatedHands:
     color[color[:, 8] == 0] = 0
     depth = np.zeros((n, 2, CELLS, CELLS), np.float32)
     depth[:, 1] = 1
-    return SimulatedHands(hands(n), depth, np.zeros((n, 7, 3), np.float32), np.full((n, 1), 2, np.float32), color)
+    context, distance = np.zeros((n, 7, 3), np.float32), np.full((n, 1), 2, np.float32)
+    image = rng.integers(0, 256, (n, 3, PIXELS, PIXELS)).astype(np.uint8)
+    return SimulatedHands(hands(n), depth, context, distance, np.full((n, 2), 0.05, np.float32), image, color)
 
 
-def network(depth, context, distance, color):
+def network(depth, context, distance, color, sigma, image):
     """Right with depth, 60 degrees off without; a confidence that colour raises."""
     n, seen = len(depth), depth[:, 1].any((1, 2))
-    assert np.all(depth[~seen, 0] == EMPTY)
+    assert np.all(depth[~seen, 0] == EMPTY) and sigma.shape == (n, 2) and image.dtype == np.float32
+    assert (image[color[:, 8] == 0] == GREY).all() or seen.all()  # posture alone has no image
     normal = np.where(seen[:, None], turned(np.zeros(n)), turned(np.full(n, 60)))
     sure = np.where(color[:, 8] > 0, 2.0, -4.0)
     return normal, normal, np.zeros((n, 2)), np.zeros((n, 21, 3)), sure

@@ -14,10 +14,10 @@ from scipy.spatial.transform import Rotation  # noqa: E402
 
 from understudy.errors import UnderstudyError  # noqa: E402
 from understudy.hands import pool as pools  # noqa: E402
-from understudy.hands.crop import CELL, EMPTY, HandView, crop_rotation  # noqa: E402
+from understudy.hands.crop import CELL, EMPTY, GREY, PIXEL, PIXELS, HandView, crop_rotation  # noqa: E402
 from understudy.hands.net import HandNormalNet, loss, von_mises_fisher  # noqa: E402
 from understudy.hands.pool import HandPool, PoolConfig  # noqa: E402
-from understudy.hands.training import HandTrainConfig, HandTrainer, varied  # noqa: E402
+from understudy.hands.training import HandTrainConfig, HandTrainer, inputs, relit, varied  # noqa: E402
 from understudy.skeleton import HAND_KEYPOINTS  # noqa: E402
 from understudy.synthetic import hand_samples  # noqa: E402
 from understudy.synthetic.bodies import load_bank  # noqa: E402
@@ -25,8 +25,9 @@ from understudy.synthetic.draw import Draw  # noqa: E402
 from understudy.synthetic.hand_bank import FOREARM, articulate, load_hands, palm_normals, shortest_turn  # noqa: E402
 from understudy.synthetic.hand_color import color_words  # noqa: E402
 from understudy.synthetic.hand_grips import BAR, FREE, Board, GripConfig, draw_board, draw_grips, held_points  # noqa: E402
+from understudy.synthetic.hand_images import HandScene, hand_image  # noqa: E402
 from understudy.synthetic.hand_samples import HandBatch, HandSamples, depth_crop, turned  # noqa: E402
-from understudy.synthetic.render import FAR, pixel_rays  # noqa: E402
+from understudy.synthetic.render import FAR, pixel_rays, splat, splat_which  # noqa: E402
 
 STRAIGHT = torch.tensor([[-1.0, 0.0, 0.0]])
 
@@ -209,6 +210,54 @@ def test_torch_and_numpy_crops_are_the_same():
     np.testing.assert_allclose(R, crop_rotation(view.center, up.numpy()), atol=1e-9)
 
 
+def test_splat_knows_the_point_that_is_seen():
+    """Each pixel's point is the nearest of those whose 2 x 2 pixels cover it."""
+    points = torch.randn(2, 60, 3, generator=torch.Generator().manual_seed(2)) * 0.1 + torch.tensor([0.0, 0.0, 2.0])
+    points[0, 3] = torch.nan
+    scale, size = torch.full((2,), 100.0), 24
+    z, which = splat_which(points, scale, size)
+    torch.testing.assert_close(z, splat(points, torch.zeros(2, 60, dtype=torch.bool), scale, size)[0])
+    assert ((which < 0) == (z > FAR - 1)).all() and (which >= 0).any() and not (which[0] == 3).any()
+    for b, v, u in (which >= 0).nonzero().tolist():
+        point = points[b, which[b, v, u]]
+        assert abs(float(point[2] - z[b, v, u])) < 1e-3
+        corner = point[:2] / point[2] * 100 + size / 2 - 1
+        assert 0 <= u - corner[0].floor() <= 1 and 0 <= v - corner[1].floor() <= 1
+
+
+def test_images_show_the_hand_where_it_is():
+    """A square of skin, half of it behind a box: its colour is where its points are, and not where the box is."""
+    step = torch.linspace(-0.05, 0.05, 60)
+    y, x = torch.meshgrid(step, step, indexing="ij")
+    skin = torch.stack([x, y, torch.full_like(x, 2.0)], -1).reshape(1, -1, 3).expand(6, -1, 3)
+    normals = torch.tensor([0.0, 0.0, -1.0]).expand_as(skin)
+    boxes = torch.full((6, PIXELS, PIXELS), FAR)
+    boxes[:, :, : PIXELS // 2] = 1.0
+    scene = HandScene(
+        skin, normals, torch.zeros(skin.shape[:2], dtype=torch.bool), torch.tensor([[0.0, 0.0, 1.0]]).expand(6, 3),
+        torch.full((6, 1, 3), torch.nan), torch.full((6, 1, 3), torch.nan), torch.zeros(1, dtype=torch.long),
+        boxes, torch.full_like(boxes, FAR), torch.full((6,), 2.0), torch.full((6,), 0.001),
+    )  # fmt: skip
+    image = hand_image(Draw(3), scene).float()
+    middle, half = PIXELS // 2, int(0.05 / PIXEL)
+    hand = image[:, :, middle - half + 3 : middle + half - 3, middle + 3 : middle + half - 3].flatten(2).median(2)[0]
+    red, green, blue = hand.unbind(1)
+    assert ((red > green) & (green > blue)).all()  # skin
+    beside = image[:, :, middle - half + 3 : middle + half - 3, middle - half + 3 : middle - 3].flatten(2).median(2)[0]
+    assert ((hand - beside).abs().amax(1) > 15).float().mean() > 0.8
+
+
+def test_relit_images_stay_images():
+    image = torch.full((400, 3, 4, 4), 128, dtype=torch.uint8)
+    image[:, 0] = 200
+    out = relit(Draw(0), image)
+    assert out.min() >= 0 and out.max() <= 255
+    none = (out == GREY).flatten(1).all(1)
+    assert 0.1 < float(none.float().mean()) < 0.3
+    colors = out[~none].mean((2, 3))
+    assert float((colors[:, 0] - colors[:, 1]).median()) > 30
+
+
 def test_variation_moves_everything_together(batch):
     out = varied(Draw(8), batch)
     shift = (out.landmarks - batch.landmarks)[:, 0]
@@ -225,6 +274,18 @@ def test_variation_moves_everything_together(batch):
         kept = after[rows, columns] < EMPTY
         expected = (source + shift[k, 2]).clamp_max(0.2)[kept]
         torch.testing.assert_close(after[rows, columns][kept], expected, atol=1e-4, rtol=0)
+
+
+def test_variation_moves_the_image_as_the_depth(batch, monkeypatch):
+    monkeypatch.setattr("understudy.hands.training.relit", lambda draw, image: image)
+    out = varied(Draw(8), batch)
+    shift = (out.landmarks - batch.landmarks)[:, 0, :2]
+    pixels = (shift / PIXEL).round().long()
+    torch.testing.assert_close(pixels * PIXEL, shift, atol=1e-5, rtol=0)
+    for k in range(8):
+        du, dv = pixels[k].tolist()
+        moved = out.image[k][:, 8:-8, 8:-8]
+        assert torch.equal(moved, batch.image[k][:, 8 - dv : PIXELS - 8 - dv, 8 - du : PIXELS - 8 - du])
 
 
 def test_color_words_err_as_measured():
@@ -258,7 +319,7 @@ def test_von_mises_fisher_is_a_density():
 
 def test_loss_wants_the_truth(batch):
     net = HandNormalNet().eval()
-    out = net(batch.depth, batch.context, batch.distance, torch.zeros(96, 9))
+    out = net(*inputs(batch, torch.zeros(96, 9)))
     right = out._replace(normal=batch.normal, direction=batch.direction, landmarks=batch.landmarks)
     wrong = right._replace(normal=-batch.normal)
     assert (

@@ -8,11 +8,11 @@ from itertools import count
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float, Float32, UInt8
 from scipy.special import expit
 
 from understudy.errors import MissingExtraError, UnderstudyError
-from understudy.hands.crop import EMPTY
+from understudy.hands.crop import EMPTY, GREY
 from understudy.hands.estimator import LEAST_CONFIDENCE
 from understudy.hands.nets import WRIST
 
@@ -37,6 +37,8 @@ class SimulatedHands:
     depth: Float32[np.ndarray, "n 2 48 48"]
     context: Float32[np.ndarray, "n 7 3"]
     distance: Float32[np.ndarray, "n 1"]
+    sigma: Float32[np.ndarray, "n 2"]
+    image: UInt8[np.ndarray, "n 3 72 72"]
     color: Float32[np.ndarray, "n 9"]
     """simulated words of the colour path"""
 
@@ -80,6 +82,8 @@ def simulate(n: int, progress: bool = True) -> SimulatedHands:
         arrays["depth"],
         arrays["context"],
         arrays["distance"],
+        arrays["sigma"],
+        arrays["image"],
         torch.cat(words)[:n].numpy(),
     )
 
@@ -110,20 +114,21 @@ def from_simulation(simulated: SimulatedHands, network: HandNetwork) -> Source:
         raise UnderstudyError("simulated hands: there are none; at least 1 is needed")
     blind = np.zeros_like(simulated.depth)
     blind[:, 0] = EMPTY
-    mute = np.zeros_like(simulated.color)
-    every = _ask(network, simulated, simulated.depth, simulated.color)
+    mute, grey = np.zeros_like(simulated.color), np.full_like(simulated.image, GREY)
+    every = _ask(network, simulated, simulated.depth, simulated.color, simulated.image)
     word, given = simulated.color.astype(np.float64), simulated.color[:, 8] > 0
     said = {
         BOTH: least_sure(every),
         ALL_GIVEN: every,
-        DEPTH: least_sure(_ask(network, simulated, simulated.depth, mute)),
-        POSTURE: _ask(network, simulated, blind, mute),
+        DEPTH: least_sure(_ask(network, simulated, simulated.depth, mute, grey)),
+        POSTURE: _ask(network, simulated, blind, mute, grey),
         WORD: Said(np.where(given[:, None], word[:, :3], np.nan), np.where(given, word[:, 7], np.nan)),
     }
     about = (
         f"{n} hands in view of simulated people, hands and scenes that neither training nor validation has seen "
         f"({BODIES} bodies, {HANDS} different hands), as they are put to the exported network: depth crops with a "
-        "sensor's errors, joints with an estimate's errors, and words of the colour path with its measured errors."
+        "sensor's errors, colour crops, joints with an estimate's errors, and words of the colour path with its "
+        "measured errors."
     )
     return Source("Simulated hands in detail", "simulated", (), True, simulated.hands, said, about, {})
 
@@ -133,12 +138,18 @@ def _ask(
     hands: SimulatedHands,
     depth: Float32[np.ndarray, "n 2 48 48"],
     color: Float32[np.ndarray, "n 9"],
+    image: UInt8[np.ndarray, "n 3 72 72"],
 ) -> Said:
     parts = []
     for start in range(0, len(depth), _ASKED):
         rows = slice(start, start + _ASKED)
         normal, _, _, _, sure = network(
-            depth=depth[rows], context=hands.context[rows], distance=hands.distance[rows], color=color[rows]
+            depth=depth[rows],
+            context=hands.context[rows],
+            distance=hands.distance[rows],
+            color=color[rows],
+            sigma=hands.sigma[rows],
+            image=image[rows].astype(np.float32),
         )
         parts.append(Said(normal.astype(np.float64), expit(sure.astype(np.float64))))
     return Said.pooled(parts)

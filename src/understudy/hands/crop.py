@@ -9,10 +9,12 @@ Metres.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from typing import Final
 
+import cv2
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float, Float32, UInt8
 
 from understudy.camera import Camera
 from understudy.skeleton import JOINT, rows
@@ -25,6 +27,12 @@ HALF: Final = 0.18
 CELL: Final = 2 * HALF / CELLS
 EMPTY: Final = 1.0
 """depth of cells without a measurement"""
+PIXELS: Final = 72
+"""of the colour crop's edge, which covers what the depth crop covers"""
+PIXEL: Final = 2 * HALF / PIXELS
+"""metres at the crop's distance"""
+GREY: Final = 128
+"""of colour crops where nothing is seen"""
 LIMIT: Final = 0.2
 """metres: depths are cut off so far from the crop's distance"""
 BEYOND: Final = 0.07
@@ -35,6 +43,13 @@ CONTEXT: Final = ("wrist", "elbow", "shoulder", "other_shoulder", "neck", "hips"
 """Joints whose places the network is given; the hand's own side first"""
 
 _OTHER = {"left": "right", "right": "left"}
+SIGMA: Final = 0.06
+"""metres: of joints whose uncertainty is not known, radius that holds 68 % of the errors"""
+UNSURE: Final = ("wrist", "elbow")
+"""Joints of whose uncertainty the network is told"""
+
+_KNOTS = 13  # in a row, at which it is projected
+_SHARPEST = 4  # times as fine as the colour crop at most: where it is averaged from
 _NEAREST_Z = 0.1  # metres: nothing nearer to the camera is measured
 
 
@@ -48,12 +63,17 @@ class HandView:
     """metres, colour camera's frame"""
     context: Float[np.ndarray, "7 3"]
     """CONTEXT in view coordinates"""
+    sigma: Float[np.ndarray, "2"]
+    """metres, of UNSURE: radius of the ball that holds 68 % of the errors"""
 
     @classmethod
-    def of(cls, joints: Float[np.ndarray, "18 3"], side: str) -> HandView | None:
+    def of(
+        cls, joints: Float[np.ndarray, "18 3"], side: str, sigma_m: Float[np.ndarray, "18"] | None = None
+    ) -> HandView | None:
         """The view of a person's hand; None when wrist or elbow are not known (NaN) or lie behind the camera.
 
-        Other joints that are not known are taken to be in the middle of those that are.
+        Other joints that are not known are taken to be in the middle of those that are. sigma_m: of the joints, as
+        `Person` has it; SIGMA where it is not known.
         """
         known = arm_context(joints, side)
         if not np.isfinite(known[:2]).all() or known[0, 2] < _NEAREST_Z:
@@ -66,7 +86,8 @@ class HandView:
         center = seen[0] + BEYOND * forearm
         R = crop_rotation(center, -forearm)
         middle = np.array([0.0, 0.0, np.linalg.norm(center)])
-        return cls(R * mirror, center * mirror, seen @ R.T - middle)
+        unsure = np.full(len(UNSURE), np.nan) if sigma_m is None else sigma_m[rows(*(f"{side}_{n}" for n in UNSURE))]
+        return cls(R * mirror, center * mirror, seen @ R.T - middle, np.nan_to_num(unsure, nan=SIGMA))
 
     @property
     def distance(self) -> float:
@@ -91,7 +112,7 @@ class HandView:
 
         points: what the camera measured, colour camera's frame. `CELLS` columns across `2 * HALF` at the centre.
         """
-        x, y, z = np.einsum("ij,nj->in", self.R, points)
+        x, y, z = self.R @ points.T
         depth = z - self.distance
         with np.errstate(divide="ignore", invalid="ignore"):
             scale = self.distance / CELL / z
@@ -101,6 +122,22 @@ class HandView:
         cell = v[inside].astype(np.int32) * CELLS + u[inside].astype(np.int32)
         np.minimum.at(near, cell, depth[inside].clip(max=LIMIT).astype(np.float32))
         return np.stack([near, (near < EMPTY).astype(np.float32)]).reshape(2, CELLS, CELLS)
+
+    def color_crop(self, camera: Camera, image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "72 72 3"]:
+        """The colour image as it is seen along the view, `PIXELS` columns across `2 * HALF` at the centre's distance;
+        GREY outside the image. camera: of the image.
+        """
+        finer = int(np.clip(round(PIXEL * camera.fx / self.distance), 1, _SHARPEST))
+        knots = np.linspace(-HALF, HALF, _KNOTS) / self.distance
+        x, y = np.meshgrid(knots, knots)
+        rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3) @ self.R
+        uv = np.nan_to_num(camera.project(rays), nan=-1e4).reshape(_KNOTS, _KNOTS, 2)
+        fill = _between(finer * PIXELS)
+        u, v = ((fill @ uv[..., i] @ fill.T).astype(np.float32) for i in range(2))
+        grey = (GREY, GREY, GREY)
+        seen = cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=grey)
+        small: np.ndarray = cv2.resize(seen, (PIXELS, PIXELS), interpolation=cv2.INTER_AREA)
+        return small
 
     def points_near(self, depth: RegisteredDepth, margin: float = 0.0) -> Float[np.ndarray, "n 3"]:
         """The measured points that `depth_crop` needs: those in the crop's part of the image.
@@ -113,6 +150,13 @@ class HandView:
         measured = z > 0
         chosen = z[measured].astype(np.float64)
         return np.stack([rays[0][measured] * chosen, rays[1][measured] * chosen, chosen], axis=1)
+
+
+@cache
+def _between(n: int) -> Float[np.ndarray, "n k"]:
+    """Linear interpolation between the knots at the centres of n pixels."""
+    at = (np.arange(n) + 0.5) * (_KNOTS - 1) / n
+    return np.maximum(1 - np.abs(at[:, None] - np.arange(_KNOTS)), 0.0)
 
 
 def arm_context(joints: Float[np.ndarray, "18 3"], side: str) -> Float[np.ndarray, "7 3"]:

@@ -9,17 +9,17 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float, Float32, UInt8
 
 from understudy.camera import Camera
 from understudy.errors import ModelFileError, UnderstudyError
 from understudy.hands.color_path import SIDES, ColorPalm, ColorPath
-from understudy.hands.crop import CELL, CELLS, EMPTY, HandView
+from understudy.hands.crop import CELL, CELLS, EMPTY, GREY, PIXELS, HandView
 from understudy.hands.nets import HandNets, load_nets
 from understudy.hands.predictor import HandPrediction, HandPredictor, color_word, pooled
 from understudy.registration import register
 from understudy.skeleton import JOINT
-from understudy.types import OBSERVED, Frame, Hands, Palm, Person, RegisteredDepth, RegisteredFrame
+from understudy.types import OBSERVED, Frame, Hands, Palm, Person, RegisteredFrame
 from understudy.voxels import rotation_to
 
 LEAST_CONFIDENCE: Final = 0.18
@@ -39,11 +39,12 @@ class HandNormalEstimator:
     """Which way the palms of an estimated person face, in the colour camera's frame.
 
     1. `HandView`: where the body says that a hand is, how large and how turned; left or right is the body's word.
-    2. `ColorPath`: palm detection and hand landmarks on crops of the colour image, where the wrist is seen (optional).
-    3. `HandView.depth_crop`: the depth around the hand; several crops, as far apart as the wrist is uncertain.
-    4. `HandPredictor`: a network that is told the depth, the body's joints and the colour path's word, trained to weigh
-       them; where the fingers cannot be seen, what the forearm and the posture make likely is left. `pooled` joins what
-       it says of the crops.
+    2. `HandView.depth_crop`, `color_crop`: depth and colour around the hand; several crops, as far apart as the wrist
+       is uncertain.
+    3. `ColorPath`: where the wrist is seen, palm detection and hand landmarks on larger crops of the colour image
+       (optional).
+    4. `HandPredictor`: a network that is told all this, and the body's joints, trained to weigh it; where the fingers
+       cannot be seen, what the forearm and the posture make likely is left. `pooled` joins what it says of the crops.
     """
 
     def __init__(
@@ -53,20 +54,21 @@ class HandNormalEstimator:
         weights: Path | None = None,
         nets: HandNets | None = None,
     ):
-        """color: use the colour image, too; where its two networks cannot be had, a warning says so and depth alone is
-        used. least_confidence: in [0, 1]; palms that are less sure are left out. weights: an exported network of one's
-        own. nets: the colour path's networks, when they are loaded already.
+        """color: use the colour image, too; where the colour path's two networks cannot be had, a warning says so and
+        it is left out. least_confidence: in [0, 1]; palms that are less sure are left out. weights: an exported network
+        of one's own. nets: the colour path's networks, when they are loaded already.
         """
         if not 0 <= least_confidence <= 1:
             raise UnderstudyError(f"least_confidence {least_confidence}: must be in [0, 1]")
         self.least_confidence = least_confidence
         self.predictor = HandPredictor(weights)
+        self.color = color
         self.color_path: ColorPath | None = None
         if color:
             try:
                 self.color_path = ColorPath(nets or load_nets())
             except ModelFileError as e:
-                warnings.warn(f"palms are estimated from depth alone: {e}", stacklevel=2)
+                warnings.warn(f"palms are estimated without the colour path: {e}", stacklevel=2)
 
     def estimate(self, frame: Frame | RegisteredFrame, person: Person) -> Hands:
         """'left', 'right' -> Palm, or None; `Hands.why` then says why."""
@@ -76,16 +78,15 @@ class HandNormalEstimator:
         """The hands of several people of one frame."""
         registered = frame if isinstance(frame, RegisteredFrame) else register(frame)
         places = [self._views(registered.camera, person) for person in people]
-        words = [self._words(registered, person, views) for person, (views, _) in zip(people, places, strict=True)]
+        seen = [self._color_palms(registered, person, views) for person, (views, _) in zip(people, places, strict=True)]
         hands = [
-            _Hand(i, side, several, np.stack(_crops(registered.depth, several)), words[i].get(side))
+            _Hand(i, side, several, *_crops(registered, several, self.color), seen[i].get(side))
             for i, (views, _) in enumerate(places)
             for side, several in views.items()
         ]
-        said = iter(self._predict(hands))
+        words = self._predict(hands)
         palms: list[dict[str, Palm]] = [{} for _ in people]
-        for hand in hands:
-            word = pooled([next(said) for _ in hand.views])
+        for hand, word in zip(hands, words, strict=True):
             if word.confidence < self.least_confidence:
                 why = f"too unsure: within 30 degrees with a probability of {word.confidence:.2f} only"
                 places[hand.person][1][hand.side] = why
@@ -93,14 +94,23 @@ class HandNormalEstimator:
                 palms[hand.person][hand.side] = hand.palm(registered.camera, word)
         return [Hands(p.get("left"), p.get("right"), why) for p, (_, why) in zip(palms, places, strict=True)]
 
+    def _color_palms(
+        self, frame: RegisteredFrame, person: Person, views: dict[str, list[HandView]]
+    ) -> dict[str, ColorPalm | None]:
+        if self.color_path is None or not views:
+            return {}
+        seen = [side for side in views if person.source[JOINT[f"{side}_wrist"]] == OBSERVED]
+        return self.color_path.estimate(frame, person, seen)
+
     def _predict(self, hands: Sequence[_Hand]) -> list[HandPrediction]:
-        """Of all views of all hands."""
+        """Of each hand, from all its views."""
         if not hands:
             return []
         color = np.stack([color_word(view, hand.color) for hand in hands for view in hand.views])
-        return self.predictor(
-            [v for hand in hands for v in hand.views], np.concatenate([h.crops for h in hands]), color
-        )
+        views = [v for hand in hands for v in hand.views]
+        depth, image = (np.concatenate([getattr(h, name) for h in hands]) for name in ("crops", "images"))
+        said = iter(self.predictor(views, depth, color, image))
+        return [pooled([next(said) for _ in hand.views]) for hand in hands]
 
     def _views(self, camera: Camera, person: Person) -> tuple[dict[str, list[HandView]], dict[str, str]]:
         """The views of each hand, or why there are none."""
@@ -119,21 +129,13 @@ class HandNormalEstimator:
                 views[side] = several
         return views, why
 
-    def _words(
-        self, frame: RegisteredFrame, person: Person, views: dict[str, list[HandView]]
-    ) -> dict[str, ColorPalm | None]:
-        if self.color_path is None or not views:
-            return {}
-        seen = [side for side in views if person.source[JOINT[f"{side}_wrist"]] == OBSERVED]
-        return self.color_path.estimate(frame, person, seen)
-
 
 def hypotheses(person: Person, side: str) -> list[HandView]:
     """Views of where a hand may be: where the wrist is believed to be, then at the corners of a tetrahedron around it,
     as large as its sigma says; a wrist that is known well enough has the first only. None without an arm.
     """
     row = JOINT[f"{side}_wrist"]
-    first = HandView.of(person.keypoints, side)
+    first = HandView.of(person.keypoints, side, person.sigma_m)
     if first is None:
         return []
     sigma = min(float(np.nan_to_num(person.sigma_m[row], nan=_SIGMA_MOST)) / _BALL, _SIGMA_MOST)
@@ -144,14 +146,20 @@ def hypotheses(person: Person, side: str) -> list[HandView]:
     steps = _STEP * sigma * _TETRAHEDRON @ rotation_to(ray) * mirror
     moved = np.repeat(person.keypoints[None], len(steps), axis=0)
     moved[:, row] += steps
-    return [first, *(view for joints in moved if (view := HandView.of(joints, side)) is not None)]
+    return [first, *(view for joints in moved if (view := HandView.of(joints, side, person.sigma_m)) is not None)]
 
 
-def _crops(depth: RegisteredDepth, views: Sequence[HandView]) -> list[Float32[np.ndarray, "2 48 48"]]:
-    """The depth crops of several views of one hand."""
+def _crops(
+    frame: RegisteredFrame, views: Sequence[HandView], color: bool
+) -> tuple[Float32[np.ndarray, "n 2 48 48"], UInt8[np.ndarray, "n 72 72 3"]]:
+    """The crops of depth and colour image of several views of one hand; the latter GREY when it is not to be used."""
     apart = max(float(np.linalg.norm(view.center - views[0].center)) for view in views)
-    cloud = views[0].points_near(depth, apart)
-    return [view.depth_crop(cloud) for view in views]
+    cloud = views[0].points_near(frame.depth, apart)
+    if color:
+        images = np.stack([view.color_crop(frame.camera, frame.color) for view in views])
+    else:
+        images = np.full((len(views), PIXELS, PIXELS, 3), GREY, np.uint8)
+    return np.stack([view.depth_crop(cloud) for view in views]), images
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,7 +171,9 @@ class _Hand:
     side: str
     views: list[HandView]
     crops: Float32[np.ndarray, "n 2 48 48"]
+    images: UInt8[np.ndarray, "n 72 72 3"]
     color: ColorPalm | None
+    """what the colour path says, where it found the palm"""
 
     def palm(self, camera: Camera, word: HandPrediction) -> Palm:
         """The result, from the pooled prediction."""

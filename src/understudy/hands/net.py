@@ -15,7 +15,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from understudy.hands.crop import CELL
+from understudy.hands.crop import CELL, GREY, SIGMA, UNSURE
 
 CONTEXT_SIZE: Final = 7
 N_LANDMARKS: Final = 21
@@ -63,20 +63,22 @@ class HandNormalNet(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        known = 3 * CONTEXT_SIZE + 1 + COLOR_SIZE
+        known = 3 * CONTEXT_SIZE + 1 + COLOR_SIZE + len(UNSURE)
         self.told = nn.Sequential(nn.Linear(known, 128), nn.ReLU(), nn.Linear(128, 128), nn.ReLU())
         self.first = _conv(2, 32, 5, 2)
-        self.bias = nn.Linear(128, 32)
-        self.fine = nn.Sequential(_Residual(32), _conv(32, 64, 3, 2), _Residual(64), _Residual(64))
-        self.bias_fine = nn.Linear(128, 64)
-        self.coarse = nn.Sequential(_conv(64, 128, 3, 2), _Residual(128), _Residual(128))
-        self.back = nn.Conv2d(128, 64, 1)
-        self.votes = nn.Sequential(_conv(64, 96, 3), nn.Conv2d(96, 4 * N_LANDMARKS, 1))
+        self.image = nn.Sequential(nn.Conv2d(3, 32, 5, stride=3, padding=1, bias=False), nn.BatchNorm2d(32), nn.ReLU())
+        self.bias_image = nn.Linear(128, 32)
+        self.join_image = _conv(64, 40, 3)
+        self.fine = nn.Sequential(_Residual(40), _conv(40, 80, 3, 2), _Residual(80), _Residual(80))
+        self.bias_fine = nn.Linear(128, 80)
+        self.coarse = nn.Sequential(_conv(80, 144, 3, 2), _Residual(144), _Residual(144))
+        self.back = nn.Conv2d(144, 80, 1)
+        self.votes = nn.Sequential(_conv(80, 96, 3), nn.Conv2d(96, 4 * N_LANDMARKS, 1))
         steps = (torch.arange(12) - 5.5) * (4 * CELL)
         v, u = torch.meshgrid(steps, steps, indexing="ij")
         self.register_buffer("grid", torch.stack([u, v, torch.zeros_like(u)]).flatten(1), persistent=False)
-        self.squeeze = _conv(128, 32, 1)
-        size = 32 * 36 + 128 + 128 + 3 * N_LANDMARKS
+        self.squeeze = _conv(144, 32, 1)
+        size = 32 * 36 + 144 + 128 + 3 * N_LANDMARKS
         self.join = nn.Sequential(nn.Linear(size, 256), nn.ReLU(), nn.Linear(256, 192), nn.ReLU())
         self.read = nn.Linear(192, 3 + 3 + 2)
         self.judge = nn.Sequential(nn.Linear(192 + 2, 48), nn.ReLU(), nn.Linear(48, 1))
@@ -87,12 +89,16 @@ class HandNormalNet(nn.Module):
         context: Float[Tensor, "b 7 3"],
         distance: Float[Tensor, "b 1"],
         color: Float[Tensor, "b 9"],
+        sigma: Float[Tensor, "b 2"],
+        image: Float[Tensor, "b 3 72 72"],
     ) -> HandOutput:
-        """Inputs as `HandBatch` has them. See `HandOutput`."""
+        """Inputs as `HandBatch` has them; image: 0 to 255, GREY everywhere where there is none. See `HandOutput`."""
         near, seen = depth[:, :1], depth[:, 1:]
-        told = self.told(torch.cat([context.flatten(1) / 0.3, distance / 3, color], 1))
+        unsure = (sigma.clamp(0.01, 0.5) / SIGMA).log()
+        told = self.told(torch.cat([context.flatten(1) / 0.3, distance / 3, color, unsure], 1))
         x = self.first(torch.cat([near * seen / 0.1, seen], 1))
-        fine = self.fine(x + self.bias(told)[:, :, None, None])
+        y = self.image((image - GREY) / 64) + self.bias_image(told)[:, :, None, None]
+        fine = self.fine(self.join_image(torch.cat([x, y], 1)))
         coarse = self.coarse(fine + self.bias_fine(told)[:, :, None, None])
         wide = F.relu(fine + F.interpolate(self.back(coarse), scale_factor=2.0, mode="nearest"))
         votes = self.votes(wide).flatten(2).unflatten(1, (N_LANDMARKS, 4))

@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float, Float32, UInt8
 from scipy.special import expit
 
 from understudy import runtime
 from understudy.hands.color_path import ColorPalm
-from understudy.hands.crop import HandView
+from understudy.hands.crop import GREY, PIXELS, HandView
 
 WEIGHTS: Final = "handnormalnet.onnx"
 _OUTPUTS = ("normal", "direction", "log_kappa", "landmarks", "sure")
@@ -54,13 +54,20 @@ class HandPredictor:
         views: Sequence[HandView],
         depth: Float32[np.ndarray, "n 2 48 48"],
         color: Float32[np.ndarray, "n 9"],
+        image: UInt8[np.ndarray, "n 72 72 3"] | None = None,
     ) -> list[HandPrediction]:
-        """depth: `HandView.depth_crop` of each view. color: `color_word` of each."""
+        """depth: `HandView.depth_crop` of each view. color: `color_word` of each. image:
+        `HandView.color_crop` of each; None without a colour image.
+        """
         if not views:
             return []
         context = np.stack([view.context for view in views]).astype(np.float32)
         distance = np.array([[view.distance] for view in views], np.float32)
-        said = self.network(depth=depth, context=context, distance=distance, color=color)
+        sigma = np.stack([view.sigma for view in views]).astype(np.float32)
+        if image is None:
+            image = np.full((len(views), PIXELS, PIXELS, 3), GREY, np.uint8)
+        picture = np.ascontiguousarray(image.transpose(0, 3, 1, 2), np.float32)
+        said = self.network(depth=depth, context=context, distance=distance, color=color, sigma=sigma, image=picture)
         normal, direction, kappa, landmarks, sure = (part.astype(np.float64) for part in said)
         normal, direction = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in (normal, direction))
         return [

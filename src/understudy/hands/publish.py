@@ -94,8 +94,9 @@ def _card(
     data = config["data"]
     return f"""# {_NAME}
 
-Says which way a palm faces (and where its fingers point, and 21 keypoints) from the depth around the hand, the joints
-of the arm and the body, and what a colour hand network says; with the probability that the normal is within 30 degrees.
+Says which way a palm faces (and where its fingers point, and 21 keypoints) from depth and colour around the hand, the
+joints of the arm and the body, and, where it is asked, what another colour hand network says; with the probability
+that the normal is within 30 degrees.
 
 - Files: {files}; {parameters:,} parameters.
 - Input and output: `understudy.hands.crop.HandView`, `understudy.hands.net`.
@@ -107,8 +108,9 @@ of the arm and the body, and what a colour hand network says; with the probabili
 - Steps: {last.get("step", "unknown")} of {config["batch"]} hands; hours: {last.get("hours", "unknown")}; torch \
 {about.get("torch", "unknown")}; CPU.
 - Data: {config["shards"]} x 512 simulated hands ({data["bodies"]} bodies and {data["hands"]} hands of anny, sensors \
-{", ".join(data["samples"]["sensors"])}), {config["epochs"]} epochs. What the colour network would say is drawn from a
-  model of its errors (`understudy.synthetic.hand_color`).
+{", ".join(data["samples"]["sensors"])}), {config["epochs"]} epochs. Colour crops are rendered with random colours
+  and light (`understudy.synthetic.hand_images`); what the other network would say is drawn from a model of its errors
+  (`understudy.synthetic.hand_color`).
 
 ## Scores
 

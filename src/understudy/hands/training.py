@@ -20,12 +20,13 @@ from pathlib import Path
 from typing import Any, Final
 
 import torch
+from jaxtyping import Float, UInt8
 from safetensors.torch import save
 from torch import Tensor
 
 from understudy.errors import UnderstudyError
 from understudy.files import read_json, write_atomically
-from understudy.hands.crop import CELL, CELLS, EMPTY, LIMIT
+from understudy.hands.crop import CELL, CELLS, EMPTY, GREY, LIMIT
 from understudy.hands.net import HandNormalNet, HandOutput, loss
 from understudy.hands.pool import SHARD, HandPool, PoolConfig
 from understudy.synthetic.draw import Draw
@@ -42,7 +43,9 @@ CONFIG, CHECKPOINT, WEIGHTS, HANDS = "config.json", "checkpoint.safetensors", "w
 FREE: Final = ("workers", "validate_every", "checkpoint_every", "log_every")
 """Fields that may change when a run goes on."""
 
-_SHIFT = 4  # cells: how far crops are moved
+_SHIFT = 4  # cells, even: how far crops are moved
+_PIXELS_2 = 3  # pixels of the colour crop in two cells of the depth crop
+_COLORLESS, _DULL = 0.2, 0.08  # share of hands without a colour crop, and with a grey one
 _DEPTH_SHIFT = 0.02  # metres, one sigma
 _COLOR_PIXELS = 1.5  # pixels of the colour image for one of the depth image
 _BLIND = 0.03  # share of hands without any depth
@@ -110,6 +113,7 @@ class HandTrainer:
         self.config, self.out = config, Path(out)
         torch.manual_seed(config.seed)
         self.net = HandNormalNet()
+        self.net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # a fifth faster on a CPU
         decay = [p for p in self.net.parameters() if p.ndim > 1]
         rest = [p for p in self.net.parameters() if p.ndim <= 1]
         groups = [{"params": decay, "weight_decay": config.weight_decay}, {"params": rest, "weight_decay": 0.0}]
@@ -221,7 +225,7 @@ class HandTrainer:
         draw = Draw(self.config.seed * 7919 + self.step)
         batch = varied(draw, batch)
         with torch.autocast("cpu", torch.bfloat16, enabled=self.config.bf16):
-            said = self.net(batch.depth, batch.context, batch.distance, colored(draw, batch))
+            said = self.net(*inputs(batch, colored(draw, batch)))
         output = HandOutput(*(part.float() for part in said))
         total, parts = loss(output, batch.normal, batch.direction, batch.landmarks)
         self.optimizer.zero_grad(set_to_none=True)
@@ -252,9 +256,9 @@ def varied(draw: Draw, batch: HandBatch) -> HandBatch:
     """The same hands, believed to be a little elsewhere, and measured a little worse."""
     b = len(batch.depth)
     depth = batch.depth.float()
-    du, dv = (draw.integers(2 * _SHIFT + 1, b) - _SHIFT for _ in range(2))
+    du, dv = (2 * draw.integers(_SHIFT + 1, b) - _SHIFT for _ in range(2))  # by whole pixels of both crops
     dz = _DEPTH_SHIFT * draw.normal(b)
-    near = _rolled(depth[:, 0], du, dv)
+    near = _rolled(depth[:, :1], du, dv, EMPTY)[:, 0]
     gone = draw.chance(draw.uniform(0, 0.4, b, 1, 1) * draw.chance(0.3, b, 1, 1), b, CELLS, CELLS)
     gone |= draw.chance(_BLIND, b, 1, 1)
     seen = (near < EMPTY) & ~gone & (near + dz[:, None, None] > -LIMIT)
@@ -263,17 +267,37 @@ def varied(draw: Draw, batch: HandBatch) -> HandBatch:
     context = batch.context + shift + 0.006 * draw.normal(*batch.context.shape)
     return batch._replace(
         depth=torch.stack([near, seen.float()], 1), context=context, distance=batch.distance - dz[:, None],
+        sigma=batch.sigma * draw.lognormal(0.15, *batch.sigma.shape),
+        image=relit(draw, _rolled(batch.image, _PIXELS_2 * du // 2, _PIXELS_2 * dv // 2, GREY)),
         landmarks=batch.landmarks + shift,
     )  # fmt: skip
 
 
-def _rolled(near: Tensor, du: Tensor, dv: Tensor) -> Tensor:
-    """Moved by (du, dv) cells; EMPTY comes in at the sides."""
-    wide = torch.nn.functional.pad(near, (_SHIFT,) * 4, value=EMPTY)
-    at = torch.arange(CELLS)
-    rows = at + _SHIFT - dv[:, None]
-    columns = at + _SHIFT - du[:, None]
-    return wide[torch.arange(len(near))[:, None, None], rows[:, :, None], columns[:, None, :]]
+def _rolled(image: Tensor, du: Tensor, dv: Tensor, fill: float) -> Tensor:
+    """(B, C, S, S) moved by (du, dv) pixels; `fill` comes in at the sides."""
+    b, c, size = image.shape[:3]
+    most = 2 * _SHIFT
+    wide = torch.nn.functional.pad(image, (most,) * 4, value=fill)
+    at = torch.arange(size) + most
+    rows, columns = (at - dv[:, None])[:, None, :, None], (at - du[:, None])[:, None, None]
+    return wide[torch.arange(b)[:, None, None, None], torch.arange(c)[:, None, None], rows, columns]
+
+
+def relit(draw: Draw, image: UInt8[Tensor, "b 3 s s"]) -> Float[Tensor, "b 3 s s"]:
+    """In other light, by other cameras; of some the colours are gone, of some there is no image (GREY)."""
+    b = len(image)
+    x = image.float() / 255
+    x = x ** draw.lognormal(0.2, b, 1, 1, 1) * draw.lognormal(0.25, b, 1, 1, 1) * draw.lognormal(0.08, b, 3, 1, 1)
+    x = x + 0.04 * draw.normal(b, 1, 1, 1)
+    dull = draw.chance(_DULL, b)[:, None, None, None]
+    x = torch.where(dull, x.mean(1, keepdim=True), x) + draw.uniform(0, 0.03, b, 1, 1, 1) * draw.normal(*x.shape)
+    none = draw.chance(_COLORLESS, b)[:, None, None, None]
+    return torch.where(none, float(GREY), 255 * x.clamp(0, 1))
+
+
+def inputs(batch: HandBatch, color: Float[Tensor, "b 9"]) -> tuple[Tensor, ...]:
+    """What the network is given of a batch, in its order."""
+    return batch.depth.float(), batch.context, batch.distance, color, batch.sigma, batch.image.float()
 
 
 def colored(draw: Draw, batch: HandBatch) -> Tensor:
@@ -289,7 +313,7 @@ def predict(net: HandNormalNet, batch: HandBatch, seed: int = 0) -> HandOutput:
     for start in range(0, len(batch.depth), _VALIDATION_BATCH):
         part = HandBatch(*(t[start : start + _VALIDATION_BATCH] for t in batch))
         color = colored(Draw(seed * 31 + start + 5), part)
-        parts.append(net(part.depth.float(), part.context, part.distance, color))
+        parts.append(net(*inputs(part, color)))
     return HandOutput(*(torch.cat(p) for p in zip(*parts, strict=True)))
 
 

@@ -12,10 +12,10 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
-from understudy.hands.crop import BEYOND, CELL, CELLS, EMPTY, LIMIT, SHORT
+from understudy.hands.crop import BEYOND, CELL, CELLS, EMPTY, LIMIT, PIXEL, PIXELS, SHORT, UNSURE
 from understudy.skeleton import JOINT
 from understudy.synthetic import render
 from understudy.synthetic.bodies import BodyBank, pose
@@ -24,9 +24,10 @@ from understudy.synthetic.draw import Draw
 from understudy.synthetic.furniture import place_boxes
 from understudy.synthetic.hand_bank import HandBank, about, articulate, palm_normals
 from understudy.synthetic.hand_grips import FREE, Board, GripConfig, draw_board, draw_grips, finger_bend, held_points
+from understudy.synthetic.hand_images import HEAD, LOWER, UPPER, HandScene, hand_image
 from understudy.synthetic.poses import NAMES, sample_poses
 from understudy.synthetic.scene import Boxes, Cameras, SceneConfig, about_z, place_cameras
-from understudy.synthetic.segments import SEGMENT
+from understudy.synthetic.segments import SEGMENT, SEGMENTS
 from understudy.synthetic.sensors import SENSORS, Rig
 
 _RASTER = 80
@@ -44,6 +45,12 @@ _ROWS = {
 _HIPS = [JOINT["right_hip"], JOINT["left_hip"]]
 _PIXEL = {"kinect2": 1 / 365, "azure": 1 / 504, "realsense": 1 / 425, "other": 1 / 320}
 """tangent of one depth pixel's angle"""
+_COLOR_PIXEL = {"kinect2": 1 / 1060, "azure": 1 / 610, "realsense": 1 / 900, "other": 1 / 600}
+"""the same of the colour image"""
+_PER_SIGMA = 0.56  # scale of the errors' directions, so that a ball of one sigma holds 68 % of them
+_SHARED = 0.4  # correlation of the wrist's errors with the elbow's
+_BARE = ("head", "neck", "hand", "fingers")
+_LEGS = ("thigh", "shin", "foot", "pelvis")
 
 
 class HandBatch(NamedTuple):
@@ -54,6 +61,10 @@ class HandBatch(NamedTuple):
     context: Float[Tensor, "b 7 3"]
     """CONTEXT, relative to the crop's centre, with the errors that estimates have"""
     distance: Float[Tensor, "b 1"]
+    sigma: Float[Tensor, "b 2"]
+    """metres, what the estimate says of the errors of UNSURE: radius of the ball that holds 68 % of them"""
+    image: UInt8[Tensor, "b 3 72 72"]
+    """RGB, as `HandView.color_crop`"""
     normal: Float[Tensor, "b 3"]
     """truth: unit, out of the palm"""
     direction: Float[Tensor, "b 3"]
@@ -85,9 +96,11 @@ class HandConfig:
     """share of hands that are under cloth, or gone in it"""
     sleeves: float = 0.6
     """share of forearms in sleeves"""
-    wrist_m: float = 0.025
-    """one sigma of the estimated wrist along each axis; a fifth of them three times as much"""
-    joint_m: float = 0.04
+    wrist_m: tuple[float, float] = (0.07, 0.6)
+    """errors of the estimated wrist: median of the radius that holds 68 % of them, and the spread of its logarithm"""
+    elbow_m: tuple[float, float] = (0.055, 0.45)
+    """the same of the elbow"""
+    joint_m: tuple[float, float] = (0.04, 0.35)
     """the same of the other joints"""
 
 
@@ -116,6 +129,8 @@ class _Hands:
     """which points are the hand's own, not the forearm's"""
     covered: Bool[Tensor, " b"]
     """under cloth"""
+    clothed: Bool[Tensor, "b p"]
+    """which points are cloth"""
     held: Float[Tensor, "b q 3"]
     marks: Float[Tensor, "b 21 3"]
     normal: Float[Tensor, "b 3"]
@@ -130,6 +145,8 @@ class _Views:
     """Where the crops look; the same frame."""
 
     context: Float[Tensor, "b 7 3"]
+    sigma: Float[Tensor, "b 7"]
+    """metres: what is known of the errors"""
     R: Float[Tensor, "b 3 3"]
     """R_view_cam"""
     distance: Float[Tensor, " b"]
@@ -157,6 +174,8 @@ class HandSamples:
     def __init__(self, bodies: BodyBank, hands: HandBank, config: HandConfig | None = None, seed: int = 0):
         self.bodies, self.hands, self.config, self.seed = bodies, hands, config or HandConfig(), seed
         self._keep = torch.arange(0, bodies.points.shape[1], _THINNED)
+        wear = [HEAD if n.endswith(_BARE) else LOWER if n.endswith(_LEGS) else UPPER for n in SEGMENTS]
+        self._wear = torch.tensor(wear)[bodies.segment[self._keep]]
         self._limb = {
             side: (bodies.weights[:, [SEGMENT[f"{side}_hand"], SEGMENT[f"{side}_fingers"]]].sum(1) > 0.2)
             | ((bodies.segment == SEGMENT[f"{side}_forearm"]) & (bodies.along > 0.45))
@@ -201,6 +220,7 @@ class HandSamples:
         pitch = torch.tensor([_PIXEL[n] for n in self.config.sensors])[people.rig.kind]
         pitch = pitch * draw.lognormal(0.15, len(known))
         depth = self._measured(draw, people.rig, mirror, exact, views, pitch)
+        image = self._image(draw, people, side, mirror, hands, views)
         inside = people.rig.seen_by(people.rig.color_tan, hands.marks * mirror)
         middle = torch.zeros(len(known), 1, 3)
         middle[:, 0, 2] = views.distance
@@ -208,6 +228,8 @@ class HandSamples:
             depth=depth,
             context=views.seen(views.context) - middle,
             distance=views.distance[:, None],
+            sigma=views.sigma[:, : len(UNSURE)],
+            image=image,
             normal=views.seen(hands.normal[:, None])[:, 0],
             direction=views.seen(hands.direction[:, None])[:, 0],
             landmarks=views.seen(hands.marks) - middle,
@@ -239,6 +261,7 @@ class HandSamples:
             skin=skin @ axes + wrist[:, None],
             counts=self.hands.of_hand,
             covered=covered,
+            clothed=~(cloth[..., 0] == 0),
             normals=hand.normals @ axes,
             held=held @ axes + wrist[:, None],
             marks=hand.landmarks @ axes + wrist[:, None],
@@ -264,10 +287,10 @@ class HandSamples:
 
     def _views(self, draw: Draw, people: _People, mirror: Tensor, known: Float[Tensor, "b 7 3"]) -> _Views:
         """What is believed of the body, and where it makes one look."""
-        context = self._believed(draw, known)
+        context, sigma = self._believed(draw, known)
         forearm = torch.nn.functional.normalize(context[:, 0] - context[:, 1], dim=1)
         center = context[:, 0] + BEYOND * forearm
-        return _Views(context, crop_rotation(center, -forearm), center.norm(dim=1), people.rig.baseline * mirror)
+        return _Views(context, sigma, crop_rotation(center, -forearm), center.norm(dim=1), people.rig.baseline * mirror)
 
     def _exact(
         self, people: _People, side: str, mirror: Tensor, hands: _Hands, views: _Views
@@ -285,11 +308,40 @@ class HandSamples:
         share = visible_share(detail[:, :n], ~away[..., 0] & hands.counts, exact, views.scale)
         return exact, torch.where(hands.covered, 0.0, share)
 
+    def _image(
+        self, draw: Draw, people: _People, side: str, mirror: Tensor, hands: _Hands, views: _Views
+    ) -> UInt8[Tensor, "b 3 72 72"]:
+        """What the colour camera sees around the hand."""
+        away = ((hands.normals * hands.skin).sum(-1) > 0)[..., None]
+        rays = render.pixel_rays(views.distance / PIXEL, PIXELS)
+        to_world = ((rays.flatten(1, 2) @ views.R) * mirror) @ people.cameras.R_cam_world
+        z_boxes = render.cast(people.boxes, people.cameras.center, to_world)
+        board = hands.board.moved(views.R.mT, torch.zeros_like(hands.normal))
+        tangent = torch.tensor([_COLOR_PIXEL[n] for n in self.config.sensors])[people.rig.kind]
+        scene = HandScene(
+            skin=views.seen(hands.skin + torch.where(away, torch.nan, 0.0)),
+            normals=views.seen(hands.normals),
+            clothed=hands.clothed,
+            palm=views.seen(hands.normal[:, None])[:, 0],
+            held=views.seen(hands.held),
+            body=views.seen(self._rest(people, side, mirror)),
+            wear=self._wear,
+            z_boxes=z_boxes.reshape(-1, PIXELS, PIXELS),
+            z_board=board.cast(rays),
+            distance=views.distance,
+            pixel=tangent * draw.lognormal(0.15, len(tangent)) * views.distance,
+        )
+        return hand_image(draw, scene)
+
+    def _rest(self, people: _People, side: str, mirror: Tensor) -> Float[Tensor, "b n 3"]:
+        """Points of the body; NaN where they are the arm's end. Colour camera's frame, mirrored."""
+        gone = torch.where(self._limb[side][self._keep], torch.nan, 0.0)[:, None]
+        return people.cameras.to_cam(people.points[:, self._keep]) * mirror + gone
+
     def _background(self, people: _People, side: str, mirror: Tensor, views: _Views) -> Float[Tensor, "b s s"]:
         """Depth of the rest of the body and of the furniture, coarsely."""
         scale, size = views.scale / _COARSE, _RASTER // _COARSE
-        gone = torch.where(self._limb[side][self._keep], torch.nan, 0.0)[:, None]
-        rest = views.seen(people.cameras.to_cam(people.points[:, self._keep]) * mirror + gone) - views.offset
+        rest = views.seen(self._rest(people, side, mirror)) - views.offset
         z_body, _ = render.splat(rest, torch.zeros(rest.shape[:2], dtype=torch.bool), scale, size)
         rays = render.pixel_rays(scale, size).flatten(1, 2)
         to_world = people.cameras.R_cam_world
@@ -309,15 +361,21 @@ class HandSamples:
         ok &= rig.seen_by(rig.color_tan, (cloud @ views.R) * mirror)
         return depth_crop(cloud, ok, views.distance)
 
-    def _believed(self, draw: Draw, joints: Float[Tensor, "b 7 3"]) -> Float[Tensor, "b 7 3"]:
-        """Joints with the errors of estimates: each its own, more along the view, and a depth that all share."""
+    def _believed(
+        self, draw: Draw, joints: Float[Tensor, "b 7 3"]
+    ) -> tuple[Float[Tensor, "b 7 3"], Float[Tensor, "b 7"]]:
+        """Joints with the errors of estimates, and what is known of the errors (metres).
+
+        The errors are larger along the view; the wrist's are partly the elbow's; all joints share one of depth.
+        """
         b, n = joints.shape[:2]
-        sigma = torch.full((n,), self.config.joint_m)
-        sigma[0] = self.config.wrist_m
-        gross = torch.where(draw.chance(0.2, b, n), 3.0, 1.0)
+        kinds = torch.tensor([self.config.wrist_m, self.config.elbow_m, *[self.config.joint_m] * (n - 2)])
+        sigma = kinds[:, 0] * torch.exp(kinds[:, 1] * draw.normal(b, n).clamp(-2.5, 2.5))
         ray = torch.nn.functional.normalize(joints, dim=2)
-        noise = draw.normal(b, n, 3) * 0.8 + ray * draw.normal(b, n, 1) * 0.9
-        return joints + noise * (sigma * gross)[..., None] + ray * 0.02 * draw.normal(b, 1, 1)
+        noise = (draw.normal(b, n, 3) * 0.8 + ray * draw.normal(b, n, 1) * 0.9) * _PER_SIGMA
+        noise[:, 0] = _SHARED * noise[:, 1] + (1 - _SHARED**2) ** 0.5 * noise[:, 0]
+        noise = noise * draw.lognormal(0.25, b, n, 1) * sigma[..., None]
+        return joints + noise + ray * 0.02 * draw.normal(b, 1, 1), sigma
 
 
 def turned(

@@ -45,6 +45,29 @@ def splat(
     return depth.reshape(b, size, size), (buffer % 2 == 1).reshape(b, size, size)
 
 
+def splat_which(
+    points: Float[Tensor, "b n 3"], scale: Float[Tensor, " b"], size: int
+) -> tuple[Float[Tensor, "b s s"], Int[Tensor, "b s s"]]:
+    """As `splat`, and the number of the point that each pixel sees; -1 for none."""
+    b, n = points.shape[:2]
+    z = points[..., 2]
+    ok = z > _NEAREST  # False for NaN
+    uv = points[..., :2] / z.clamp_min(_NEAREST)[..., None] * scale[:, None, None] + size / 2 - 1.0
+    corner = uv.nan_to_num(-9.0).clamp(-9, size + 9).floor().long()
+    key = (z.nan_to_num(FAR) * _TICKS).long() * n + torch.arange(n, device=points.device)
+    nothing = int(FAR * _TICKS) * n
+    buffer = torch.full((b, size * size), nothing, dtype=torch.int64, device=points.device)
+    for dy in (0, 1):
+        for dx in (0, 1):
+            u, v = corner[..., 0] + dx, corner[..., 1] + dy
+            inside = ok & (u >= 0) & (u < size) & (v >= 0) & (v < size)
+            index = torch.where(inside, v * size + u, 0)
+            buffer.scatter_reduce_(1, index, torch.where(inside, key, nothing), "amin")
+    depth = torch.div(buffer, n, rounding_mode="floor").float() / _TICKS
+    which = torch.where(buffer < nothing, buffer % n, -1)
+    return depth.reshape(b, size, size), which.reshape(b, size, size)
+
+
 def pixel_rays(scale: Float[Tensor, " b"], size: int) -> Float[Tensor, "b s s 3"]:
     """Directions (z = 1) of the pixels' centres."""
     offset = torch.arange(size, device=scale.device, dtype=torch.float32) + 0.5 - size / 2
