@@ -9,7 +9,7 @@ from typing import Final
 from understudy import detectors, methods
 from understudy.detectors.base import Detector
 from understudy.errors import UnderstudyError, one_of
-from understudy.hands.estimator import HandNormalEstimator
+from understudy.hands.estimator import HandNormalEstimator, within_10_cm
 from understudy.methods import METHODS
 from understudy.registration import register
 from understudy.types import Frame, Keypoints2D, Person, RegisteredFrame
@@ -82,8 +82,8 @@ class Estimator:
         return [person.with_id(i) for i, person in enumerate(self._lifter.lift(frame, keypoints))]
 
     def find_hands(self, frame: RegisteredFrame, people: list[Person]) -> list[Person]:
-        """Stage 4. The same people with their palms."""
+        """Stage 4. The same people with their palms, and with the wrists that the look at the hands knows better."""
         if self._hands is None:
             return people
         hands = self._hands.estimate_all(frame, people)
-        return [person.with_hands(h) for person, h in zip(people, hands, strict=True)]
+        return [p.with_hands(h).with_wrists(h.wrists, within_10_cm) for p, h in zip(people, hands, strict=True)]
