@@ -9,8 +9,8 @@ from typing import Final
 from understudy import detectors, methods
 from understudy.detectors.base import Detector
 from understudy.errors import UnderstudyError, one_of
-from understudy.hands.estimator import HandNormalEstimator
-from understudy.methods import METHODS
+from understudy.hands.estimator import HandNormalEstimator, within_10_cm
+from understudy.methods import METHODS, NAIVE
 from understudy.registration import register
 from understudy.types import Frame, Keypoints2D, Person, RegisteredFrame
 
@@ -26,7 +26,7 @@ class Estimator:
     2. `detect`: 2D keypoints of everybody in the colour image.
     3. `lift`: keypoints + depth -> 3D joints, by the chosen method. `voxelposenet` has stages of its own
        (`voxel_lifting`: root, view, network, assembly); `naive` is the baseline.
-    4. `find_hands`: which way the palms face (`understudy.hands`).
+    4. `find_hands`: which way the palms face, and where exactly the wrists are that are seen (`understudy.hands`).
 
     Stateless: frames may come in any order, and from several threads at once. Identities over time are the business of
     `tracking`.
@@ -82,8 +82,13 @@ class Estimator:
         return [person.with_id(i) for i, person in enumerate(self._lifter.lift(frame, keypoints))]
 
     def find_hands(self, frame: RegisteredFrame, people: list[Person]) -> list[Person]:
-        """Stage 4. The same people with their palms."""
+        """Stage 4. The same people with their palms, and (but for naive lifting) with the wrists that the look at the
+        hands knows better.
+        """
         if self._hands is None:
             return people
         hands = self._hands.estimate_all(frame, people)
-        return [person.with_hands(h) for person, h in zip(people, hands, strict=True)]
+        found = [person.with_hands(h) for person, h in zip(people, hands, strict=True)]
+        if self.method == NAIVE:  # a baseline of lifted keypoints stays one
+            return found
+        return [person.with_wrists(h.wrists, within_10_cm) for person, h in zip(found, hands, strict=True)]

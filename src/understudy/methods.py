@@ -12,9 +12,10 @@ from understudy.lifting import Lifter, NaiveLifter
 from understudy.voxel_lifting import VoxelLifter
 
 DEFAULT: Final = "voxelposenet"
+NAIVE: Final = "naive"
 
 _LIFTERS: Final = MappingProxyType[str, Callable[[float, Path | None], Lifter]](
-    {"voxelposenet": lambda score, weights: VoxelLifter(score, weights), "naive": lambda score, _: NaiveLifter(score)}
+    {"voxelposenet": lambda score, weights: VoxelLifter(score, weights), NAIVE: lambda score, _: NaiveLifter(score)}
 )
 METHODS: Final = tuple(_LIFTERS)
 """Names: the voxel network, and the baseline it is measured against."""

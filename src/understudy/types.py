@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
 from understudy.camera import Camera, RGBDCamera, check_registered
 from understudy.errors import FrameError, UnderstudyError
-from understudy.skeleton import N_JOINTS
+from understudy.skeleton import JOINT, N_JOINTS
 
 OBSERVED, INFERRED, MISSING = "observed", "inferred", "missing"
 """Values of `Person.source`."""
@@ -171,6 +172,15 @@ class Palm:
         return np.column_stack([np.cross(y, self.normal), y, self.normal])
 
 
+class Wrist(NamedTuple):
+    """Where the look at a hand found its wrist."""
+
+    position: Float[np.ndarray, "3"]
+    """metres, colour camera's frame"""
+    sigma_m: float
+    """as `Person.sigma_m`"""
+
+
 @dataclass(frozen=True, eq=False)
 class Hands(Mapping[str, "Palm | None"]):
     """A person's palms: a mapping from 'left' and 'right'."""
@@ -179,6 +189,8 @@ class Hands(Mapping[str, "Palm | None"]):
     right: Palm | None = None
     why: Mapping[str, str] = field(default_factory=dict)
     """side -> why there is no palm; empty where hands were not looked at"""
+    wrists: Mapping[str, Wrist] = field(default_factory=dict)
+    """side -> the wrist, of hands that were looked at, also of those without a palm; not part of files"""
 
     def __getitem__(self, side: str) -> Palm | None:
         if side not in ("left", "right"):
@@ -233,3 +245,19 @@ class Person:
 
     def with_hands(self, hands: Hands) -> Person:
         return replace(self, hands=hands)
+
+    def with_wrists(self, wrists: Mapping[str, Wrist], confidence: Callable[[float], float]) -> Person:
+        """The same with the wrists ('left', 'right') that are surer than the skeleton's, of those that are observed:
+        of a hidden one a look at the hand says nothing new. confidence: of a sigma.
+        """
+        surer = {
+            JOINT[f"{side}_wrist"]: wrist
+            for side, wrist in wrists.items()
+            if wrist.sigma_m < self.sigma_m[JOINT[f"{side}_wrist"]] and self.source[JOINT[f"{side}_wrist"]] == OBSERVED
+        }
+        if not surer:
+            return self
+        keypoints, sure, sigma = self.keypoints.copy(), self.confidence.copy(), self.sigma_m.copy()
+        for row, wrist in surer.items():
+            keypoints[row], sigma[row], sure[row] = wrist.position, wrist.sigma_m, confidence(wrist.sigma_m)
+        return replace(self, keypoints=keypoints, confidence=sure, sigma_m=sigma)
