@@ -333,16 +333,16 @@ def test_pooling_believes_the_sure_and_doubts_disagreement() -> None:
 def test_wrists_that_the_hands_know_better_replace_the_skeletons() -> None:
     joints = skeleton(7)
     before = replace(person(joints), sigma_m=np.full(N_JOINTS, 0.06), confidence=np.full(N_JOINTS, 0.5))
-    there = Wrist(np.array([0.1, 0.2, 2.0]), 0.03)
-    after = before.with_wrists({"left": there, "right": Wrist(np.zeros(3), 0.07)}, within_10_cm)
+    there = Wrist(np.array([0.1, 0.2, 2.0]), 0.03, 0.99)
+    after = before.with_wrists({"left": there, "right": Wrist(np.zeros(3), 0.07, 0.9)})
     row = JOINT["left_wrist"]
     rest = np.arange(N_JOINTS) != row
     np.testing.assert_array_equal(after.keypoints[row], there.position)
-    assert after.sigma_m[row] == 0.03 and after.confidence[row] > 0.99
+    assert after.sigma_m[row] == 0.03 and after.confidence[row] == 0.99
     for name in ("keypoints", "sigma_m", "confidence"):
         np.testing.assert_array_equal(getattr(after, name)[rest], getattr(before, name)[rest])
     hidden = replace(before, source=("inferred",) * N_JOINTS)
-    assert hidden.with_wrists({"left": there}, within_10_cm) is hidden
+    assert hidden.with_wrists({"left": there}) is hidden
 
 
 def test_within_10_cm_is_the_share_of_normal_errors() -> None:
@@ -350,8 +350,9 @@ def test_within_10_cm_is_the_share_of_normal_errors() -> None:
     lengths = np.linalg.norm(errors, axis=1)
     sigma = float(np.quantile(lengths, 0.68))
     assert within_10_cm(sigma) == pytest.approx(float((lengths < 0.1).mean()), abs=0.01)
-    sure, unsure = (wrist_of(_word([0, 0, 1], c)).sigma_m for c in (0.95, 0.3))
-    assert 0.02 < sure < 0.05 < unsure < 0.11
+    sure, unsure = (wrist_of(_word([0, 0, 1], c)) for c in (0.95, 0.3))
+    assert 0.02 < sure.sigma_m < 0.05 < unsure.sigma_m < 0.11
+    assert 0.95 < sure.confidence <= 1 and unsure.confidence == within_10_cm(unsure.sigma_m)
 
 
 def test_hand_is_looked_for_as_far_as_the_wrist_is_uncertain() -> None:

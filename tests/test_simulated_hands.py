@@ -19,14 +19,15 @@ from understudy.hands.net import HandNormalNet, loss, von_mises_fisher  # noqa: 
 from understudy.hands.pool import HandPool, PoolConfig  # noqa: E402
 from understudy.hands.training import HandTrainConfig, HandTrainer, inputs, relit, varied  # noqa: E402
 from understudy.skeleton import HAND_KEYPOINTS  # noqa: E402
-from understudy.synthetic import hand_samples  # noqa: E402
 from understudy.synthetic.bodies import load_bank  # noqa: E402
 from understudy.synthetic.draw import Draw  # noqa: E402
 from understudy.synthetic.hand_bank import FOREARM, articulate, load_hands, palm_normals, shortest_turn  # noqa: E402
 from understudy.synthetic.hand_color import color_words  # noqa: E402
+from understudy.synthetic.hand_crops import crop_rotation as torch_crop_rotation  # noqa: E402
+from understudy.synthetic.hand_crops import depth_crop  # noqa: E402
 from understudy.synthetic.hand_grips import BAR, FREE, Board, GripConfig, draw_board, draw_grips, held_points  # noqa: E402
 from understudy.synthetic.hand_images import HandScene, hand_image  # noqa: E402
-from understudy.synthetic.hand_samples import HandBatch, HandSamples, depth_crop, turned  # noqa: E402
+from understudy.synthetic.hand_samples import HandBatch, HandSamples, turned  # noqa: E402
 from understudy.synthetic.render import FAR, pixel_rays, splat, splat_which  # noqa: E402
 
 STRAIGHT = torch.tensor([[-1.0, 0.0, 0.0]])
@@ -206,7 +207,7 @@ def test_torch_and_numpy_crops_are_the_same():
     ).mean() < 1e-3  # a point on a cell's very edge may be rounded to either side
     up = torch.tensor(view.center - points[0])
     up = up / up.norm()
-    R = hand_samples.crop_rotation(torch.tensor(view.center)[None], up[None])[0].numpy()
+    R = torch_crop_rotation(torch.tensor(view.center)[None], up[None])[0].numpy()
     np.testing.assert_allclose(R, crop_rotation(view.center, up.numpy()), atol=1e-9)
 
 

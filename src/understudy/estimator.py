@@ -9,7 +9,7 @@ from typing import Final
 from understudy import detectors, methods
 from understudy.detectors.base import Detector
 from understudy.errors import UnderstudyError, one_of
-from understudy.hands.estimator import HandNormalEstimator, within_10_cm
+from understudy.hands.estimator import HandNormalEstimator
 from understudy.methods import METHODS, NAIVE
 from understudy.registration import register
 from understudy.types import Frame, Keypoints2D, Person, RegisteredFrame
@@ -91,4 +91,4 @@ class Estimator:
         found = [person.with_hands(h) for person, h in zip(people, hands, strict=True)]
         if self.method == NAIVE:  # a baseline of lifted keypoints stays one
             return found
-        return [person.with_wrists(h.wrists, within_10_cm) for person, h in zip(found, hands, strict=True)]
+        return [person.with_wrists(h.wrists) for person, h in zip(found, hands, strict=True)]

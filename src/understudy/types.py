@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -179,6 +179,8 @@ class Wrist(NamedTuple):
     """metres, colour camera's frame"""
     sigma_m: float
     """as `Person.sigma_m`"""
+    confidence: float
+    """as `Person.confidence`"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -246,9 +248,9 @@ class Person:
     def with_hands(self, hands: Hands) -> Person:
         return replace(self, hands=hands)
 
-    def with_wrists(self, wrists: Mapping[str, Wrist], confidence: Callable[[float], float]) -> Person:
+    def with_wrists(self, wrists: Mapping[str, Wrist]) -> Person:
         """The same with the wrists ('left', 'right') that are surer than the skeleton's, of those that are observed:
-        of a hidden one a look at the hand says nothing new. confidence: of a sigma.
+        of a hidden one a look at the hand says nothing new.
         """
         surer = {
             JOINT[f"{side}_wrist"]: wrist
@@ -259,5 +261,5 @@ class Person:
             return self
         keypoints, sure, sigma = self.keypoints.copy(), self.confidence.copy(), self.sigma_m.copy()
         for row, wrist in surer.items():
-            keypoints[row], sigma[row], sure[row] = wrist.position, wrist.sigma_m, confidence(wrist.sigma_m)
+            keypoints[row], sigma[row], sure[row] = wrist.position, wrist.sigma_m, wrist.confidence
         return replace(self, keypoints=keypoints, confidence=sure, sigma_m=sigma)

@@ -141,7 +141,8 @@ def wrist_of(word: HandPrediction) -> Wrist:
     """The wrist among the network's keypoints. It was told the skeleton's and how uncertain that is, so its own is what
     both say; how far it is off goes with how sure it is of the palm.
     """
-    return Wrist(word.landmarks[0], float(np.interp(word.confidence, *_WRIST_SIGMA)))
+    sigma = float(np.interp(word.confidence, *_WRIST_SIGMA))
+    return Wrist(word.landmarks[0], sigma, within_10_cm(sigma))
 
 
 def within_10_cm(sigma_m: float) -> float:

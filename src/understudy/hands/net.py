@@ -1,8 +1,8 @@
-"""HandNormalNet (torch): depth around a hand, the arm's and body's joints, the colour path's word -> the palm.
+"""HandNormalNet (torch): depth and colour around a hand, arm's and body's joints, the colour path's word -> the palm.
 
-Made for a CPU: a small residual network over 48 x 48 depth, whose features meet those of the joints. It gives von
-Mises-Fisher distributions of the palm's normal and of the fingers' direction, 21 landmarks, and the chance that the
-normal is within 30 degrees. Coordinates are those of the crop view; every hand is a right one.
+Made for a CPU: a small residual network over 48 x 48 depth and 72 x 72 colour, whose features meet those of the joints.
+It gives von Mises-Fisher distributions of the palm's normal and of the fingers' direction, 21 landmarks, and the chance
+that the normal is within 30 degrees. Coordinates are those of the crop view; every hand is a right one.
 """
 
 from __future__ import annotations

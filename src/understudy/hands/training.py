@@ -44,7 +44,7 @@ FREE: Final = ("workers", "validate_every", "checkpoint_every", "log_every")
 """Fields that may change when a run goes on."""
 
 _SHIFT = 4  # cells, even: how far crops are moved
-_PIXELS_2 = 3  # pixels of the colour crop in two cells of the depth crop
+_PIXELS_IN_TWO_CELLS = 3  # pixels of the colour crop in two cells of the depth crop
 _COLORLESS, _DULL = 0.2, 0.08  # share of hands without a colour crop, and with a grey one
 _DEPTH_SHIFT = 0.02  # metres, one sigma
 _COLOR_PIXELS = 1.5  # pixels of the colour image for one of the depth image
@@ -268,7 +268,7 @@ def varied(draw: Draw, batch: HandBatch) -> HandBatch:
     return batch._replace(
         depth=torch.stack([near, seen.float()], 1), context=context, distance=batch.distance - dz[:, None],
         sigma=batch.sigma * draw.lognormal(0.15, *batch.sigma.shape),
-        image=relit(draw, _rolled(batch.image, _PIXELS_2 * du // 2, _PIXELS_2 * dv // 2, GREY)),
+        image=relit(draw, _rolled(batch.image, _PIXELS_IN_TWO_CELLS * du // 2, _PIXELS_IN_TWO_CELLS * dv // 2, GREY)),
         landmarks=batch.landmarks + shift,
     )  # fmt: skip
 

@@ -26,46 +26,40 @@ def splat(
     points: camera's frame, metres. scale: focal length in pixels; the optical axis meets the image's centre.
     Returns depths (metres; FAR where there is nothing), and the labels of what is seen.
     """
-    b = len(points)
-    z = points[..., 2]
-    ok = z > _NEAREST  # False for NaN
-    uv = points[..., :2] / z.clamp_min(_NEAREST)[..., None] * scale[:, None, None] + size / 2 - 1.0
-    corner = uv.nan_to_num(-9.0).clamp(-9, size + 9).floor().int()
-    key = (z.nan_to_num(FAR) * _TICKS).int() * 2 + label.int()
-    nothing = int(FAR * _TICKS) * 2
-    buffer = torch.full((b, size * size), nothing, dtype=torch.int32, device=points.device)
-    for dy in (0, 1):
-        for dx in (0, 1):
-            u, v = corner[..., 0] + dx, corner[..., 1] + dy
-            inside = ok & (u >= 0) & (u < size) & (v >= 0) & (v < size)
-            index = torch.where(inside, v * size + u, 0)
-            value = torch.where(inside, key, nothing)
-            buffer.scatter_reduce_(1, index.long(), value, "amin")
+    key = (points[..., 2].nan_to_num(FAR) * _TICKS).int() * 2 + label.int()
+    buffer = _least(points, key, int(FAR * _TICKS) * 2, scale, size)
     depth = torch.div(buffer, 2, rounding_mode="floor").float() / _TICKS
-    return depth.reshape(b, size, size), (buffer % 2 == 1).reshape(b, size, size)
+    return depth, buffer % 2 == 1
 
 
 def splat_which(
     points: Float[Tensor, "b n 3"], scale: Float[Tensor, " b"], size: int
 ) -> tuple[Float[Tensor, "b s s"], Int[Tensor, "b s s"]]:
     """As `splat`, and the number of the point that each pixel sees; -1 for none."""
-    b, n = points.shape[:2]
-    z = points[..., 2]
+    n = points.shape[1]
+    nothing = int(FAR * _TICKS) * n
+    key = (points[..., 2].nan_to_num(FAR) * _TICKS).long() * n + torch.arange(n, device=points.device)
+    buffer = _least(points, key, nothing, scale, size)
+    depth = torch.div(buffer, n, rounding_mode="floor").float() / _TICKS
+    return depth, torch.where(buffer < nothing, buffer % n, -1)
+
+
+def _least(
+    points: Float[Tensor, "b n 3"], key: Int[Tensor, "b n"], nothing: int, scale: Float[Tensor, " b"], size: int
+) -> Int[Tensor, "b s s"]:
+    """The least key of the points that cover each pixel (see `splat`); `nothing` where there is none."""
+    b, z = len(points), points[..., 2]
     ok = z > _NEAREST  # False for NaN
     uv = points[..., :2] / z.clamp_min(_NEAREST)[..., None] * scale[:, None, None] + size / 2 - 1.0
-    corner = uv.nan_to_num(-9.0).clamp(-9, size + 9).floor().long()
-    key = (z.nan_to_num(FAR) * _TICKS).long() * n + torch.arange(n, device=points.device)
-    nothing = int(FAR * _TICKS) * n
-    buffer = torch.full((b, size * size), nothing, dtype=torch.int64, device=points.device)
+    corner = uv.nan_to_num(-9.0).clamp(-9, size + 9).floor().int()
+    buffer = torch.full((b, size * size), nothing, dtype=key.dtype, device=points.device)
     for dy in (0, 1):
         for dx in (0, 1):
             u, v = corner[..., 0] + dx, corner[..., 1] + dy
             inside = ok & (u >= 0) & (u < size) & (v >= 0) & (v < size)
             index = torch.where(inside, v * size + u, 0)
-            buffer.scatter_reduce_(1, index, torch.where(inside, key, nothing), "amin")
-    depth = torch.div(buffer, n, rounding_mode="floor").float() / _TICKS
-    which = torch.where(buffer < nothing, buffer % n, -1)
-    return depth.reshape(b, size, size), which.reshape(b, size, size)
+            buffer.scatter_reduce_(1, index.long(), torch.where(inside, key, nothing), "amin")
+    return buffer.reshape(b, size, size)
 
 
 def pixel_rays(scale: Float[Tensor, " b"], size: int) -> Float[Tensor, "b s s 3"]:
