@@ -22,6 +22,7 @@ from understudy.skeleton import HAND_KEYPOINTS  # noqa: E402
 from understudy.synthetic.bodies import load_bank  # noqa: E402
 from understudy.synthetic.draw import Draw  # noqa: E402
 from understudy.synthetic.hand_bank import FOREARM, articulate, load_hands, palm_normals, shortest_turn  # noqa: E402
+from understudy.synthetic.hand_clothes import SKIN  # noqa: E402
 from understudy.synthetic.hand_color import color_words  # noqa: E402
 from understudy.synthetic.hand_crops import crop_rotation as torch_crop_rotation  # noqa: E402
 from understudy.synthetic.hand_crops import depth_crop  # noqa: E402
@@ -235,9 +236,9 @@ def test_images_show_the_hand_where_it_is():
     boxes = torch.full((6, PIXELS, PIXELS), FAR)
     boxes[:, :, : PIXELS // 2] = 1.0
     scene = HandScene(
-        skin, normals, torch.zeros(skin.shape[:2], dtype=torch.bool), torch.tensor([[0.0, 0.0, 1.0]]).expand(6, 3),
+        skin, normals, torch.full(skin.shape[:2], SKIN), torch.tensor([[0.0, 0.0, 1.0]]).expand(6, 3),
         torch.full((6, 1, 3), torch.nan), torch.full((6, 1, 3), torch.nan), torch.zeros(1, dtype=torch.long),
-        boxes, torch.full_like(boxes, FAR), torch.full((6,), 2.0), torch.full((6,), 0.001),
+        boxes, torch.full_like(boxes, FAR), torch.full((6,), -1), torch.full((6,), 2.0), torch.full((6,), 0.001),
     )  # fmt: skip
     image = hand_image(Draw(3), scene).float()
     middle, half = PIXELS // 2, int(0.05 / PIXEL)

@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from understudy.hands.training import HandTrainConfig, HandTrainer
 
 PRESET = "hands"
-_FLAGS = ("batch", "seed", "workers")
-_NOT_HERE = ("steps", "bodies", "without_sensor", "bvh", "init", "device")
+_FLAGS = ("batch", "init", "seed", "workers")
+_NOT_HERE = ("steps", "bodies", "without_sensor", "bvh", "device")
 
 
 def wanted(arguments: argparse.Namespace) -> bool:
@@ -79,4 +79,7 @@ def _config(arguments: argparse.Namespace) -> HandTrainConfig:
         config = filled(read_json(own)["config"], config, str(own))
     if arguments.config is not None:
         config = filled(read_json(arguments.config), config, str(arguments.config))
-    return replace(config, **{n: getattr(arguments, n) for n in _FLAGS if getattr(arguments, n) is not None})
+    given = {n: getattr(arguments, n) for n in _FLAGS if getattr(arguments, n) is not None}
+    if "init" in given:
+        given["init"] = str(given["init"])
+    return replace(config, **given)

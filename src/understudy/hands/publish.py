@@ -9,14 +9,14 @@ from typing import Any, Final
 
 import torch
 import torch.nn.functional as F
-from safetensors.torch import load_file, save
+from safetensors.torch import save
 
 from understudy.errors import UnderstudyError
 from understudy.files import read_json, write_atomically
 from understudy.hands.export import export_onnx
 from understudy.hands.net import WITHIN, HandNormalNet
 from understudy.hands.pool import HandPool
-from understudy.hands.training import CONFIG, WEIGHTS, HandTrainer, predict, scores
+from understudy.hands.training import CONFIG, WEIGHTS, HandTrainer, predict, read_net, scores
 from understudy.synthetic.hand_samples import HandBatch
 from understudy.voxelposenet import records
 
@@ -39,17 +39,14 @@ def publish(run: Path, out: Path, progress: bool = False) -> list[Path]:
     pool.fill(
         trainer.config.workers, lambda done: print(f"simulated hands: {done} of {pool.shards}") if progress else 0
     )
-    net = HandNormalNet()
-    net.load_state_dict(load_file(run / WEIGHTS))
-    net.eval()
+    net = read_net(run / WEIGHTS).eval()
     first, second = _halves(pool)
     calibrate(net, first)
     state = {k: v.half() if v.is_floating_point() else v for k, v in net.state_dict().items()}
     made = [out / f"{_NAME}.safetensors", out / f"{_NAME}.onnx"]
     write_atomically(made[0], save(state, {"run": json.dumps(about["config"])}))
-    shipped = HandNormalNet()
-    shipped.load_state_dict({k: v.float() if v.is_floating_point() else v for k, v in state.items()})
-    export_onnx(shipped.eval(), made[1])
+    shipped = read_net(made[0]).eval()
+    export_onnx(shipped, made[1])
     last = records.read(run / records.VALIDATION)[-1:] or [{}]
     sizes = {path.name: path.stat().st_size / 1e6 for path in made}
     parameters = sum(p.numel() for p in net.parameters())

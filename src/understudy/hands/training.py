@@ -20,11 +20,12 @@ from pathlib import Path
 from typing import Any, Final
 
 import torch
-from jaxtyping import Float, UInt8
-from safetensors.torch import save
+from jaxtyping import Bool, Float, UInt8
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save
 from torch import Tensor
 
-from understudy.errors import UnderstudyError
+from understudy.errors import ModelFileError, UnderstudyError, one_of
 from understudy.files import read_json, write_atomically
 from understudy.hands.crop import CELL, CELLS, EMPTY, GREY, LIMIT
 from understudy.hands.net import HandNormalNet, HandOutput, loss
@@ -34,6 +35,7 @@ from understudy.synthetic.hand_color import color_words
 from understudy.synthetic.hand_samples import HandBatch
 from understudy.voxelposenet import records
 from understudy.voxelposenet.checkpoint import load_checkpoint, save_checkpoint
+from understudy.voxelposenet.optimizers import OPTIMIZERS, Optimizers
 from understudy.voxelposenet.processes import Stop
 from understudy.voxelposenet.train_config import filled
 
@@ -43,12 +45,14 @@ CONFIG, CHECKPOINT, WEIGHTS, HANDS = "config.json", "checkpoint.safetensors", "w
 FREE: Final = ("workers", "validate_every", "checkpoint_every", "log_every")
 """Fields that may change when a run goes on."""
 
+_READERS = ("votes.1", "read", "judge")
 _SHIFT = 4  # cells, even: how far crops are moved
 _PIXELS_IN_TWO_CELLS = 3  # pixels of the colour crop in two cells of the depth crop
 _COLORLESS, _DULL = 0.2, 0.08  # share of hands without a colour crop, and with a grey one
 _DEPTH_SHIFT = 0.02  # metres, one sigma
 _COLOR_PIXELS = 1.5  # pixels of the colour image for one of the depth image
-_BLIND = 0.03  # share of hands without any depth
+_BLIND = 0.10  # share of hands without any depth
+_CUT, _CUT_FROM = 0.12, 0.1  # share of hands whose depth ends at a line, and how far from the middle at most (metres)
 _VALIDATION_BATCH = 512
 
 
@@ -61,10 +65,14 @@ class HandTrainConfig:
     """of 512 simulated hands"""
     epochs: int = 10
     batch: int = 256
+    optimizer: str = "muon"
+    """one of `optimizers.OPTIMIZERS`"""
     learning_rate: float = 2e-3
     warmup: int = 200
     weight_decay: float = 0.05
     ema: float = 0.998
+    init: str | None = None
+    """file of weights to begin with in place of random ones: a run's, or the shipped ones"""
     seed: int = 0
     validation_shards: int = 8
     validation_seed: int = 900
@@ -77,6 +85,8 @@ class HandTrainConfig:
     """processes that simulate"""
 
     def __post_init__(self) -> None:
+        if self.optimizer not in OPTIMIZERS:
+            raise UnderstudyError(f"optimizer {self.optimizer!r}: must be {one_of(OPTIMIZERS)}")
         for name in (
             "shards",
             "epochs",
@@ -112,12 +122,11 @@ class HandTrainer:
         """out: folder of the run. record: make it, or go on in it; otherwise it is only read."""
         self.config, self.out = config, Path(out)
         torch.manual_seed(config.seed)
-        self.net = HandNormalNet()
+        self.net = read_net(Path(config.init)) if config.init else HandNormalNet()
         self.net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # a fifth faster on a CPU
-        decay = [p for p in self.net.parameters() if p.ndim > 1]
-        rest = [p for p in self.net.parameters() if p.ndim <= 1]
-        groups = [{"params": decay, "weight_decay": config.weight_decay}, {"params": rest, "weight_decay": 0.0}]
-        self.optimizer = torch.optim.AdamW(groups, lr=config.learning_rate)
+        self.optimizers = Optimizers(
+            self.net, config.optimizer, config.learning_rate, config.weight_decay, _READERS
+        )
         self.average = {k: v.detach().clone() for k, v in self.net.state_dict().items()}
         self.step, self.seconds = 0, 0.0
         if record:
@@ -148,7 +157,7 @@ class HandTrainer:
                         "choose another folder, or delete that one"
                     )
         if (self.out / CHECKPOINT).exists():
-            self.step, self.seconds = load_checkpoint(self.out / CHECKPOINT, self.net, self.average, self.optimizer)
+            self.step, self.seconds = load_checkpoint(self.out / CHECKPOINT, self.net, self.average, self.optimizers.each)
         for name in (records.LOG, records.VALIDATION):
             records.keep_until(self.out / name, self.step)
         about = {"kind": KIND, "config": now, "command": sys.argv, "torch": torch.__version__}
@@ -220,18 +229,16 @@ class HandTrainer:
 
     def _learn(self, batch: HandBatch) -> dict[str, Tensor]:
         self.net.train()
-        for group in self.optimizer.param_groups:
-            group["lr"] = self.config.rate(self.step, self.steps)
         draw = Draw(self.config.seed * 7919 + self.step)
         batch = varied(draw, batch)
         with torch.autocast("cpu", torch.bfloat16, enabled=self.config.bf16):
             said = self.net(*inputs(batch, colored(draw, batch)))
         output = HandOutput(*(part.float() for part in said))
         total, parts = loss(output, batch.normal, batch.direction, batch.landmarks)
-        self.optimizer.zero_grad(set_to_none=True)
+        self.optimizers.zero_grad()
         total.backward()
         torch.nn.utils.clip_grad_norm_(self.net.parameters(), 5.0)
-        self.optimizer.step()
+        self.optimizers.step(self.config.rate(self.step, self.steps))
         keep = min(self.config.ema, (self.step + 1) / (self.step + 10))
         with torch.no_grad():
             for k, v in self.net.state_dict().items():
@@ -248,8 +255,18 @@ class HandTrainer:
         return net.eval()
 
     def _save(self) -> None:
-        save_checkpoint(self.out / CHECKPOINT, self.net, self.average, self.optimizer, self.step, self.seconds)
+        save_checkpoint(self.out / CHECKPOINT, self.net, self.average, self.optimizers.each, self.step, self.seconds)
         write_atomically(self.out / WEIGHTS, save({k: v.contiguous() for k, v in self.average.items()}))
+
+
+def read_net(path: Path) -> HandNormalNet:
+    """The network with the weights of a file. Raises ModelFileError when they are not this network's."""
+    net = HandNormalNet()
+    try:
+        net.load_state_dict({k: v.float() if v.is_floating_point() else v for k, v in load_file(path).items()})
+    except (OSError, SafetensorError, RuntimeError) as e:
+        raise ModelFileError(f"{path}: not readable weights of this network: {e}") from e
+    return net
 
 
 def varied(draw: Draw, batch: HandBatch) -> HandBatch:
@@ -260,7 +277,7 @@ def varied(draw: Draw, batch: HandBatch) -> HandBatch:
     dz = _DEPTH_SHIFT * draw.normal(b)
     near = _rolled(depth[:, :1], du, dv, EMPTY)[:, 0]
     gone = draw.chance(draw.uniform(0, 0.4, b, 1, 1) * draw.chance(0.3, b, 1, 1), b, CELLS, CELLS)
-    gone |= draw.chance(_BLIND, b, 1, 1)
+    gone |= draw.chance(_BLIND, b, 1, 1) | _cut(draw, b)
     seen = (near < EMPTY) & ~gone & (near + dz[:, None, None] > -LIMIT)
     near = torch.where(seen, (near + dz[:, None, None]).clamp_max(LIMIT), EMPTY)
     shift = torch.stack([du * CELL, dv * CELL, dz], -1)[:, None]
@@ -271,6 +288,14 @@ def varied(draw: Draw, batch: HandBatch) -> HandBatch:
         image=relit(draw, _rolled(batch.image, _PIXELS_IN_TWO_CELLS * du // 2, _PIXELS_IN_TWO_CELLS * dv // 2, GREY)),
         landmarks=batch.landmarks + shift,
     )  # fmt: skip
+
+
+def _cut(draw: Draw, b: int) -> Bool[Tensor, "b s s"]:
+    """Cells beyond a line through the crop: shadows of the projector, edges of the image, dark cloth."""
+    step = (torch.arange(CELLS) + 0.5 - CELLS / 2) * CELL
+    angle = draw.uniform(0, 2 * math.pi, b, 1, 1)
+    beyond = angle.cos() * step + angle.sin() * step[:, None] > draw.uniform(-_CUT_FROM, _CUT_FROM, b, 1, 1)
+    return beyond & draw.chance(_CUT, b, 1, 1)
 
 
 def _rolled(image: Tensor, du: Tensor, dv: Tensor, fill: float) -> Tensor:

@@ -63,12 +63,16 @@ class Board:
     half: Float[Tensor, "b 2"]
     there: Bool[Tensor, " b"]
 
-    def moved(
-        self, rows: Float[Tensor, "b 3 3"], shift: Float[Tensor, "b 3"], there: Bool[Tensor, " b"] | None = None
-    ) -> Board:
+    def moved(self, rows: Float[Tensor, "b 3 3"], shift: Float[Tensor, "b 3"]) -> Board:
         """In another frame: p -> p @ rows + shift."""
-        center = (self.center[:, None] @ rows)[:, 0] + shift
-        return Board(center, self.axes @ rows, self.half, self.there if there is None else there)
+        return Board((self.center[:, None] @ rows)[:, 0] + shift, self.axes @ rows, self.half, self.there)
+
+    def under(self, other: Board) -> Board:
+        """These, and the other ones where those are there."""
+        chosen = other.there
+        center = torch.where(chosen[:, None], other.center, self.center)
+        axes = torch.where(chosen[:, None, None], other.axes, self.axes)
+        return Board(center, axes, torch.where(chosen[:, None], other.half, self.half), self.there | chosen)
 
     def cast(self, rays: Float[Tensor, "b s s 3"]) -> Float[Tensor, "b s s"]:
         """Distances along rays from the origin, in lengths of the ray; FAR where they miss."""

@@ -11,23 +11,20 @@ from typing import Final
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from understudy.hands.crop import PIXEL, PIXELS
 from understudy.synthetic import render
 from understudy.synthetic.draw import Draw
-
-UPPER: Final = 0
-LOWER: Final = 1
-HEAD: Final = 2
-"""What the parts of the body are covered with: a top, trousers, skin"""
+from understudy.synthetic.hand_clothes import SKIN
 
 COARSE: Final = 4
 """pixels of the image's in one of the body's"""
 
 _SKIN = ((0.30, 0.19, 0.13), (0.95, 0.77, 0.66))
 _TAPS = 9  # of the blur's kernel
+_REACH, _CREASE = 0.15, 0.06  # metres: what is farther from the hand, or from a crease's edges, casts no shade
 _SOFT = 0.45  # pixels: blur of every image, one sigma
 
 
@@ -38,16 +35,18 @@ class HandScene:
     skin: Float[Tensor, "b p 3"]
     """points of hand and forearm; NaN for those that face away"""
     normals: Float[Tensor, "b p 3"]
-    clothed: Bool[Tensor, "b p"]
+    hand_wear: Int[Tensor, "b p"]
+    """UPPER, LOWER or SKIN (`hand_clothes`) of these points"""
     palm: Float[Tensor, "b 3"]
     """the palm's normal"""
     held: Float[Tensor, "b q 3"]
     body: Float[Tensor, "b n 3"]
-    wear: Int[Tensor, " n"]
-    """UPPER, LOWER or HEAD of the body's points"""
+    body_wear: Int[Tensor, " n"]
     z_boxes: Float[Tensor, "b s s"]
     """depth of the furniture"""
     z_board: Float[Tensor, "b s s"]
+    board_wear: Int[Tensor, " b"]
+    """UPPER or LOWER where the board is cloth, otherwise -1"""
     distance: Float[Tensor, " b"]
     pixel: Float[Tensor, " b"]
     """metres at the hand of a pixel of the colour camera"""
@@ -57,10 +56,14 @@ def hand_image(draw: Draw, scene: HandScene) -> UInt8[Tensor, "b 3 72 72"]:
     """RGB images around the hands."""
     b, scale = len(scene.palm), scene.distance / PIXEL
     tone, upper, lower = _skin(draw, b), _cloth(draw, b), _cloth(draw, b)
-    z_hand, near = _hand(draw, scene, tone, upper, scale)
-    z_body, body = _body(draw, scene, torch.stack([upper, lower, tone], 1), scale)
+    worn = torch.stack([upper, lower, tone], 1)
+    z_hand, near = _hand(draw, scene, worn, scale)
+    z_body, body = _body(draw, scene, worn, scale)
     layers = torch.stack([z_hand, z_body, scene.z_board, scene.z_boxes, torch.full_like(z_hand, render.FAR - 1)], 1)
-    colors = torch.stack([near, body, *(_surface(draw, b) for _ in range(3))], 1)
+    board, room, wall = (_surface(draw, b) for _ in range(3))
+    board = torch.where((scene.board_wear < 0)[:, None, None, None], board, _cloth_of(draw, worn, scene.board_wear))
+    near = near * _creases(draw, z_hand, scene.distance)[:, None]
+    colors = torch.stack([near, body, board, room, wall], 1)
     first = layers.argmin(1)[:, None, None].expand(-1, 1, 3, -1, -1)
     image = _blurred(colors.gather(1, first)[:, 0], (_SOFT**2 + (0.5 * scene.pixel / PIXEL) ** 2).sqrt())
     image = image + draw.uniform(0.005, 0.04, b, 1, 1, 1) * draw.normal(*image.shape)
@@ -68,15 +71,17 @@ def hand_image(draw: Draw, scene: HandScene) -> UInt8[Tensor, "b 3 72 72"]:
 
 
 def _hand(
-    draw: Draw, scene: HandScene, tone: Float[Tensor, "b 3"], cloth: Float[Tensor, "b 3"], scale: Float[Tensor, " b"]
+    draw: Draw, scene: HandScene, worn: Float[Tensor, "b 3 3"], scale: Float[Tensor, " b"]
 ) -> tuple[Float[Tensor, "b s s"], Float[Tensor, "b 3 s s"]]:
     """Depth and colour of hand, forearm and what is held."""
-    b, p, q = len(tone), scene.skin.shape[1], scene.held.shape[1]
+    b, p, q = len(worn), scene.skin.shape[1], scene.held.shape[1]
     z, which = render.splat_which(torch.cat([scene.skin, scene.held], 1), scale, PIXELS)
+    tone = worn[:, SKIN]
     paler = draw.uniform(0, 0.35, b)[:, None] * (1 - tone.mean(1, keepdim=True))
     inner = (scene.normals * scene.palm[:, None]).sum(-1) > 0.3  # of dark hands the palms are paler
-    albedo = torch.where(inner[..., None], (tone + paler * (1 - tone))[:, None], tone[:, None])
-    albedo = torch.where(scene.clothed[..., None], cloth[:, None], albedo)
+    inner &= scene.hand_wear == SKIN
+    albedo = worn.gather(1, scene.hand_wear[..., None].expand(-1, -1, 3))
+    albedo = torch.where(inner[..., None], (tone + paler * (1 - tone))[:, None], albedo)
     light = F.normalize(draw.normal(b, 3) + torch.tensor([0.0, 0.0, -0.8]), dim=1)
     ambient = draw.uniform(0.35, 0.85, b)[:, None]
     shade = ambient + (1 - ambient) * (scene.normals * light[:, None]).sum(-1).clamp_min(0)
@@ -93,13 +98,34 @@ def _body(
     b, size = len(worn), PIXELS // COARSE
     z, which = render.splat_which(scene.body, scale / COARSE, size)
     hit = (which >= 0)[:, None].float()
-    kind = scene.wear[which.clamp_min(0)].flatten(1)[..., None].expand(-1, -1, 3)
+    kind = scene.body_wear[which.clamp_min(0)].flatten(1)[..., None].expand(-1, -1, 3)
     color = worn.gather(1, kind).mT.reshape(b, 3, size, size) * hit
     color, share = (F.interpolate(x, size=PIXELS, mode="bilinear") for x in (color, hit))  # outlines without steps
     near = F.interpolate(-F.max_pool2d(-z[:, None], 3, 1, 1), size=PIXELS, mode="nearest")
-    folds = 1 - 0.35 * _field(draw, b, 12).sigmoid() * draw.uniform(0, 1, b, 1, 1)
     z = torch.where(share > 0.5, near, render.FAR)[:, 0]
-    return z, color / share.clamp_min(0.1) * folds[:, None]
+    return z, color / share.clamp_min(0.1) * _folds(draw, b)
+
+
+def _cloth_of(draw: Draw, worn: Float[Tensor, "b 3 3"], which: Int[Tensor, " b"]) -> Float[Tensor, "b 3 s s"]:
+    """A piece of what each wears."""
+    color = worn[torch.arange(len(worn)), which.clamp_min(0)]
+    return color[..., None, None] * _folds(draw, len(worn))
+
+
+def _folds(draw: Draw, b: int) -> Float[Tensor, "b 1 s s"]:
+    return 1 - 0.35 * (_field(draw, b, 12).sigmoid() * draw.uniform(0, 1, b, 1, 1))[:, None]
+
+
+def _creases(draw: Draw, z: Float[Tensor, "b s s"], distance: Float[Tensor, " b"]) -> Float[Tensor, "b s s"]:
+    """Shade of what lies a little deeper than its surroundings, between fingers: little of the room's light gets there.
+    z: depth of the hand.
+    """
+    b = len(z)
+    near = z.sub(distance[:, None, None]).clamp(-_REACH, _REACH)[:, None]
+    around = F.avg_pool2d(near, 5, 1, 2, count_include_pad=False)
+    front = -F.max_pool2d(-near, 5, 1, 2)
+    deep = ((near - around) / 0.012).clamp(0, 1) * ((_CREASE - (near - front)) / 0.02).clamp(0, 1)
+    return (1 - draw.uniform(0, 0.6, b, 1, 1, 1) * deep)[:, 0]
 
 
 def _surface(draw: Draw, b: int) -> Float[Tensor, "b 3 s s"]:

@@ -7,7 +7,7 @@ forearm towards the elbow (so fingers that go on from the forearm point to -y), 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import torch
@@ -22,9 +22,10 @@ from understudy.synthetic.clothing import dress
 from understudy.synthetic.draw import Draw
 from understudy.synthetic.furniture import place_boxes
 from understudy.synthetic.hand_bank import HandBank, about, articulate, palm_normals
+from understudy.synthetic.hand_clothes import LOWER, SKIN, UPPER, ClothesConfig, HandClothes, dress_hands
 from understudy.synthetic.hand_crops import crop_rotation, depth_crop, sampled, visible_share
 from understudy.synthetic.hand_grips import FREE, Board, GripConfig, draw_board, draw_grips, finger_bend, held_points
-from understudy.synthetic.hand_images import HEAD, LOWER, UPPER, HandScene, hand_image
+from understudy.synthetic.hand_images import HandScene, hand_image
 from understudy.synthetic.poses import NAMES, sample_poses
 from understudy.synthetic.scene import Boxes, Cameras, SceneConfig, about_z, place_cameras
 from understudy.synthetic.segments import SEGMENT, SEGMENTS
@@ -92,10 +93,7 @@ class HandConfig:
     grips: GripConfig = field(default_factory=GripConfig)
     turned: float = 0.45
     """share of hands that are bent and twisted at the wrist by more than the posture says"""
-    pockets: float = 0.07
-    """share of hands that are under cloth, or gone in it"""
-    sleeves: float = 0.6
-    """share of forearms in sleeves"""
+    clothes: ClothesConfig = field(default_factory=ClothesConfig)
     wrist_m: tuple[float, float] = (0.07, 0.6)
     """errors of the estimated wrist: median of the radius that holds 68 % of them, and the spread of its logarithm"""
     elbow_m: tuple[float, float] = (0.055, 0.45)
@@ -127,10 +125,7 @@ class _Hands:
     normals: Float[Tensor, "b p 3"]
     counts: Bool[Tensor, " p"]
     """which points are the hand's own, not the forearm's"""
-    covered: Bool[Tensor, " b"]
-    """under cloth"""
-    clothed: Bool[Tensor, "b p"]
-    """which points are cloth"""
+    clothes: HandClothes
     held: Float[Tensor, "b q 3"]
     marks: Float[Tensor, "b 21 3"]
     normal: Float[Tensor, "b 3"]
@@ -174,7 +169,7 @@ class HandSamples:
     def __init__(self, bodies: BodyBank, hands: HandBank, config: HandConfig | None = None, seed: int = 0):
         self.bodies, self.hands, self.config, self.seed = bodies, hands, config or HandConfig(), seed
         self._keep = torch.arange(0, bodies.points.shape[1], _THINNED)
-        wear = [HEAD if n.endswith(_BARE) else LOWER if n.endswith(_LEGS) else UPPER for n in SEGMENTS]
+        wear = [SKIN if n.endswith(_BARE) else LOWER if n.endswith(_LEGS) else UPPER for n in SEGMENTS]
         self._wear = torch.tensor(wear)[bodies.segment[self._keep]]
         self._limb = {
             side: (bodies.weights[:, [SEGMENT[f"{side}_hand"], SEGMENT[f"{side}_fingers"]]].sum(1) > 0.2)
@@ -251,39 +246,26 @@ class HandSamples:
         grips = draw_grips(draw, self.config.grips, finger_bend(people.rotations, side))
         ids = draw.integers(len(self.hands), len(wrist))
         hand = articulate(self.hands, ids, grips.flex, grips.spread, (axes @ elbow[..., None])[..., 0])
-        covered = draw.chance(self.config.pockets, len(wrist)) & (grips.kind == FREE)
-        cloth = self._sleeves(draw, ids) + self._pockets(draw, covered)
-        skin = hand.points + hand.normals * cloth
+        to_hip = (people.joints[:, JOINT[f"{side}_wrist"]] - people.joints[:, JOINT[f"{side}_hip"]]).norm(dim=1)
+        along, empty = self.hands.points[ids, :, 0], grips.kind == FREE
+        sight = (axes @ torch.nn.functional.normalize(-wrist, dim=1)[..., None])[..., 0]
+        clothes = dress_hands(draw, self.config.clothes, along, self.hands.of_hand, empty, to_hip, sight)
+        skin = hand.points + hand.normals * clothes.thick[..., None]
         held = held_points(draw, grips, hand.landmarks)
         board = draw_board(draw, self.config.grips, grips)
         behind = (z * torch.nn.functional.normalize(wrist, dim=1)).sum(1) > -0.2  # of the hand, as the camera sees it
         return _Hands(
             skin=skin @ axes + wrist[:, None],
             counts=self.hands.of_hand,
-            covered=covered,
-            clothed=~(cloth[..., 0] == 0),
+            clothes=clothes,
             normals=hand.normals @ axes,
             held=held @ axes + wrist[:, None],
             marks=hand.landmarks @ axes + wrist[:, None],
             normal=(palm_normals(hand.landmarks)[:, None] @ axes)[:, 0],
             direction=x,
-            board=board.moved(axes, wrist, board.there & behind),
+            board=replace(board, there=board.there & behind).under(clothes.patch).moved(axes, wrist),
             grip=grips.kind,
         )
-
-    def _sleeves(self, draw: Draw, ids: Int[Tensor, " b"]) -> Float[Tensor, "b p 1"]:
-        """How thick the cloth is on each point, metres."""
-        b = len(ids)
-        begin, thick = draw.uniform(-0.01, 0.1, b), draw.uniform(0.003, 0.022, b)
-        covered = (self.hands.points[ids, :, 0] < -begin[:, None]) & draw.chance(self.config.sleeves, b)[:, None]
-        return (covered * thick[:, None])[..., None]
-
-    def _pockets(self, draw: Draw, covered: Bool[Tensor, " b"]) -> Float[Tensor, "b p 1"]:
-        """How thick the cloth of a pocket is on each point, metres; NaN where a hand has no shape of its own in it."""
-        b = len(covered)
-        thick = torch.where(draw.chance(0.4, b), torch.nan, draw.uniform(0.008, 0.025, b))
-        on_hand = covered[:, None] & self.hands.of_hand
-        return torch.where(on_hand, thick[:, None], 0.0)[..., None]
 
     def _views(self, draw: Draw, people: _People, mirror: Tensor, known: Float[Tensor, "b 7 3"]) -> _Views:
         """What is believed of the body, and where it makes one look."""
@@ -305,8 +287,10 @@ class HandSamples:
         rays = render.pixel_rays(views.scale, _RASTER)
         exact = torch.minimum(back, hands.board.moved(views.R.mT, -views.offset[:, 0]).cast(rays))
         n = hands.skin.shape[1]
-        share = visible_share(detail[:, :n], ~away[..., 0] & hands.counts, exact, views.scale)
-        return exact, torch.where(hands.covered, 0.0, share)
+        towards = ~away[..., 0] & hands.counts
+        bare = towards & ~hands.clothes.pocketed
+        share = visible_share(detail[:, :n], bare, exact, views.scale)
+        return exact, share * bare.sum(1) / towards.sum(1).clamp_min(1)
 
     def _image(
         self, draw: Draw, people: _People, side: str, mirror: Tensor, hands: _Hands, views: _Views
@@ -321,13 +305,14 @@ class HandSamples:
         scene = HandScene(
             skin=views.seen(hands.skin + torch.where(away, torch.nan, 0.0)),
             normals=views.seen(hands.normals),
-            clothed=hands.clothed,
+            hand_wear=hands.clothes.wear,
             palm=views.seen(hands.normal[:, None])[:, 0],
             held=views.seen(hands.held),
             body=views.seen(self._rest(people, side, mirror)),
-            wear=self._wear,
+            body_wear=self._wear,
             z_boxes=z_boxes.reshape(-1, PIXELS, PIXELS),
             z_board=board.cast(rays),
+            board_wear=torch.where(hands.clothes.patch.there, hands.clothes.patch_wear, -1),
             distance=views.distance,
             pixel=tangent * draw.lognormal(0.15, len(tangent)) * views.distance,
         )

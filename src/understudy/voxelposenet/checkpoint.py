@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
@@ -44,20 +44,21 @@ def save_checkpoint(
     path: Path,
     net: torch.nn.Module,
     average: Mapping[str, Tensor],
-    optimizer: torch.optim.Optimizer,
+    optimizers: Sequence[torch.optim.Optimizer],
     step: int,
     seconds: float,
 ) -> None:
     """All that a run needs to go on."""
     tensors = {f"net/{k}": v for k, v in net.state_dict().items()} | {f"average/{k}": v for k, v in average.items()}
-    for i, values in optimizer.state_dict()["state"].items():
-        tensors |= {f"optimizer/{i}/{k}": v for k, v in values.items()}
+    for name, optimizer in _named(optimizers):
+        for i, values in optimizer.state_dict()["state"].items():
+            tensors |= {f"{name}/{i}/{k}": v for k, v in values.items()}
     flat = {k: v.detach().cpu().contiguous().clone() for k, v in tensors.items()}
     write_atomically(path, save(flat, {"step": str(step), "seconds": str(seconds)}))
 
 
 def load_checkpoint(
-    path: Path, net: torch.nn.Module, average: dict[str, Tensor], optimizer: torch.optim.Optimizer
+    path: Path, net: torch.nn.Module, average: dict[str, Tensor], optimizers: Sequence[torch.optim.Optimizer]
 ) -> tuple[int, float]:
     """Puts back what `save_checkpoint` wrote; returns the step and the seconds of training so far.
 
@@ -65,7 +66,7 @@ def load_checkpoint(
     """
     tensors, words = _read(path)
     try:
-        return _restore(tensors, words, net, average, optimizer)
+        return _restore(tensors, words, net, average, optimizers)
     except (RuntimeError, KeyError, ValueError) as e:
         raise ModelFileError(f"{path}: not a checkpoint of this network: {e}") from e
 
@@ -75,23 +76,29 @@ def _restore(
     words: Mapping[str, str],
     net: torch.nn.Module,
     average: dict[str, Tensor],
-    optimizer: torch.optim.Optimizer,
+    optimizers: Sequence[torch.optim.Optimizer],
 ) -> tuple[int, float]:
-    parts: dict[str, dict[str, Tensor]] = {"net": {}, "average": {}, "optimizer": {}}
+    parts: dict[str, dict[str, Tensor]] = {}
     for name, tensor in tensors.items():
         part, _, rest = name.partition("/")
-        parts[part][rest] = tensor
+        parts.setdefault(part, {})[rest] = tensor
     net.load_state_dict(parts["net"])
     for k, v in parts["average"].items():
         average[k].copy_(v)
-    parameters = dict(enumerate(p for group in optimizer.param_groups for p in group["params"]))
-    state: dict[int, dict[str, Tensor]] = {}
-    for name, tensor in parts["optimizer"].items():
-        i, _, k = name.partition("/")
-        state.setdefault(int(i), {})[k] = _laid_out_as(parameters[int(i)], tensor)
-    if state:
-        optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})
+    for name, optimizer in _named(optimizers):
+        parameters = dict(enumerate(p for group in optimizer.param_groups for p in group["params"]))
+        state: dict[int, dict[str, Tensor]] = {}
+        for key, tensor in parts.get(name, {}).items():
+            i, _, k = key.partition("/")
+            state.setdefault(int(i), {})[k] = _laid_out_as(parameters[int(i)], tensor)
+        if state:
+            optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})
     return int(words["step"]), float(words["seconds"])
+
+
+def _named(optimizers: Sequence[torch.optim.Optimizer]) -> list[tuple[str, torch.optim.Optimizer]]:
+    """What they are called in the file."""
+    return [("optimizer" if i == 0 else f"optimizer{i + 1}", o) for i, o in enumerate(optimizers)]
 
 
 def _laid_out_as(parameter: Tensor, value: Tensor) -> Tensor:

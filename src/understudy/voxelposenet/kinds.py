@@ -42,6 +42,11 @@ class Kind(Protocol):
         """The network that is trained."""
         ...
 
+    @property
+    def readers(self) -> tuple[str, ...]:
+        """Beginnings of the names of parameters that read results out of features; see `optimizers`."""
+        ...
+
     def learn(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
         """The loss, and its parts for the log; `error` among them is the mean error in metres, where it is known."""
         ...
@@ -65,6 +70,8 @@ class Kind(Protocol):
 
 class DefaultKind:
     """`VoxelPoseNet` with its loss."""
+
+    readers = ("score", "features", "embedding", "judge")
 
     def __init__(self, config: TrainConfig, device: torch.device):
         self.config = config
@@ -102,6 +109,8 @@ class DefaultKind:
 
 class PaperKind:
     """The published network with its loss, on input made by `paper_data`."""
+
+    readers = ("det", "scorevolume")
 
     def __init__(self, config: TrainConfig, device: torch.device):
         self.config = config

@@ -11,6 +11,7 @@ from typing import Any, Final
 from understudy.errors import UnderstudyError, one_of
 from understudy.voxelposenet.data import DataConfig
 from understudy.voxelposenet.net import NetConfig
+from understudy.voxelposenet.optimizers import OPTIMIZERS
 
 NETWORKS: Final = ("default", "paper", "paper-fast")
 SCHEDULES: Final = ("cosine", "steps")
@@ -39,6 +40,8 @@ class TrainConfig:
     steps: int = 8000
     batch: int = 16
     """people per step and process"""
+    optimizer: str = "muon"
+    """one of `optimizers.OPTIMIZERS`"""
     learning_rate: float = 2e-3
     warmup: int = 300
     """steps of linear increase before the schedule"""
@@ -46,7 +49,7 @@ class TrainConfig:
     """`cosine`: down to a hundredth at the last step; `steps`: a tenth after every `decay_every` steps"""
     decay_every: int = 10_000
     weight_decay: float = 0.02
-    """of AdamW, for matrices; 0 makes it Adam"""
+    """of matrices and kernels; 0 makes `adamw` Adam"""
     ema: float = 0.998
     """of the moving average of the weights; 0 = none"""
     clip: float = 5.0
@@ -73,6 +76,8 @@ class TrainConfig:
     def __post_init__(self) -> None:
         if self.network not in NETWORKS:
             raise UnderstudyError(f"network {self.network!r}: must be {one_of(NETWORKS)}")
+        if self.optimizer not in OPTIMIZERS:
+            raise UnderstudyError(f"optimizer {self.optimizer!r}: must be {one_of(OPTIMIZERS)}")
         if self.schedule not in SCHEDULES:
             raise UnderstudyError(f"schedule {self.schedule!r}: must be {one_of(SCHEDULES)}")
         for name, least in _AT_LEAST.items():
@@ -108,8 +113,8 @@ PRESETS: Final = MappingProxyType(
             workers=0, compile=False,
         ),
         "paper": TrainConfig(
-            network="paper-fast", steps=40_000, batch=2, learning_rate=1e-4, warmup=0, schedule="steps",
-            weight_decay=0.0, ema=0.0, clip=0.0, bf16=False, compile=False,
+            network="paper-fast", steps=40_000, batch=2, optimizer="adamw", learning_rate=1e-4, warmup=0,
+            schedule="steps", weight_decay=0.0, ema=0.0, clip=0.0, bf16=False, compile=False,
         ),
     }
 )  # fmt: skip

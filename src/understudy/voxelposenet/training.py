@@ -36,6 +36,7 @@ from understudy.synthetic.sensors import SENSORS
 from understudy.voxelposenet import curves, kinds, records, validation
 from understudy.voxelposenet.checkpoint import load_checkpoint, save_checkpoint
 from understudy.voxelposenet.data import Batches
+from understudy.voxelposenet.optimizers import Optimizers
 from understudy.voxelposenet.processes import Stop, World
 from understudy.voxelposenet.train_config import PRESETS, TrainConfig, differences, from_json
 
@@ -70,10 +71,9 @@ class Trainer:
         self.net = self.kind.net
         if config.init:
             self.kind.load(Path(config.init))
-        decay = [p for p in self.net.parameters() if p.ndim > 1]
-        rest = [p for p in self.net.parameters() if p.ndim <= 1]
-        groups = [{"params": decay, "weight_decay": config.weight_decay}, {"params": rest, "weight_decay": 0.0}]
-        self.optimizer = torch.optim.AdamW(groups, lr=config.learning_rate, fused=True)
+        self.optimizers = Optimizers(
+            self.net, config.optimizer, config.learning_rate, config.weight_decay, self.kind.readers, fused=True
+        )
         self.average = {k: v.detach().clone() for k, v in self.net.state_dict().items()}
         self.step, self.seconds = 0, 0.0
         self._saved = -1  # step of the checkpoint on disk
@@ -89,7 +89,7 @@ class Trainer:
                     "delete that one"
                 )
         if (self.out / CHECKPOINT).exists():
-            self.step, self.seconds = load_checkpoint(self.out / CHECKPOINT, self.net, self.average, self.optimizer)
+            self.step, self.seconds = load_checkpoint(self.out / CHECKPOINT, self.net, self.average, self.optimizers.each)
             self._saved = self.step
         if self.world.size > 1:
             torch.distributed.barrier()  # all have read what the first one now writes
@@ -146,14 +146,12 @@ class Trainer:
 
     def _learn(self, model: nn.Module, batch: Batch) -> dict[str, Tensor]:
         self.net.train()
-        for group in self.optimizer.param_groups:
-            group["lr"] = self.config.rate(self.step)
         total, parts = model(*batch)
-        self.optimizer.zero_grad(set_to_none=True)
+        self.optimizers.zero_grad()
         total.backward()
         if self.config.clip:
             nn.utils.clip_grad_norm_(self.net.parameters(), self.config.clip)
-        self.optimizer.step()
+        self.optimizers.step(self.config.rate(self.step))
         keep = self.config.average_share(self.step)
         with torch.no_grad():
             for k, v in self.net.state_dict().items():
@@ -227,7 +225,7 @@ class Trainer:
     def _save(self) -> None:
         if self.world.rank or self._saved == self.step:
             return
-        save_checkpoint(self.out / CHECKPOINT, self.net, self.average, self.optimizer, self.step, self.seconds)
+        save_checkpoint(self.out / CHECKPOINT, self.net, self.average, self.optimizers.each, self.step, self.seconds)
         self.kind.save(self.out / WEIGHTS, self.average, {"step": str(self.step)})
         self._saved = self.step
 
