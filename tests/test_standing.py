@@ -5,11 +5,11 @@ import pytest
 from test_apparent_size import BODY
 from test_roots import CAMERA
 
-from understudy.apparent_size import distance_of, size_log_likelihood
+from understudy.apparent_size import LOG_DISTANCES, distance_of, size_log_likelihood
 from understudy.floor import Floor
 from understudy.roots import find_roots
-from understudy.skeleton import JOINT, JOINTS, N_JOINTS
-from understudy.standing import floor_log_likelihood
+from understudy.skeleton import JOINT, JOINTS, N_JOINTS, TORSO
+from understudy.standing import floor_log_likelihood, stood
 from understudy.types import Keypoints2D, RegisteredDepth
 
 ANKLE, HIPS = 0.11, 0.79  # metres: ankles over the floor, hips over the ankles
@@ -96,4 +96,16 @@ def test_a_root_outside_the_depth_image(size: float):
     assert with_it.evidence == "size" and len(asked) == 1
     off = [abs(root.point[2] / distance - 1) for root in (without, with_it)]
     assert off[1] < 0.1
+    assert with_it.stands is not None and without.stands is None
     assert size == 1.0 or off[1] < 0.7 * off[0]
+
+
+@pytest.mark.parametrize("floor_sigma", [0.02, 0.1, 100.0])
+def test_between_the_network_and_the_floor(floor_sigma: float):
+    """Product of two normal distributions of the log distance; nothing moves off its ray."""
+    joints = standing(3.0, 1.2)
+    trunk = np.linalg.norm(joints[TORSO].mean(0))
+    says = np.log(trunk) + 0.15
+    out = stood(joints, -0.5 * ((LOG_DISTANCES - says) / floor_sigma) ** 2)
+    share = 1 / floor_sigma ** 2 / (1 / floor_sigma ** 2 + 1 / 0.10**2)
+    assert np.allclose(out / joints, np.exp(0.15 * share), rtol=2e-3)

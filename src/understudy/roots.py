@@ -54,6 +54,8 @@ class Root:
     """share of the votes, 0 to 1: depths at the person that agree with it, and how credible it makes the size"""
     evidence: str
     """`depth`, or `size`: no depth was near the person that its apparent size (and the floor under it) allows"""
+    stands: Float[np.ndarray, "140"] | None = None
+    """of `size`, where there is a floor: how likely the trunk is at each distance, see `standing`"""
 
 
 def find_roots(
@@ -80,13 +82,18 @@ def find_roots(
     limbs = np.median(nearest_depths(depth, camera, uv[_LIMBS]), axis=1)
     measured = np.concatenate([trunk, [person.torso_z or np.nan], limbs])
     places = _elected(measured, *_unmeasured_depth(ray))
+    stands = None
     if any(kind == "size" for *_, kind in places) and (plane := floor()):
-        places = _elected(measured, *_unmeasured_depth(ray, floor_log_likelihood(ray, plane)))
+        stands = floor_log_likelihood(ray, plane)
+        places = _elected(measured, *_unmeasured_depth(ray, stands))
     if not places:  # nothing to measure the keypoints by: any depth is better than none
         values = nearest_depths(depth, camera, uv, k=1, radius=0.1)
         near = values[np.isfinite(values)]
         places = [(float(np.median(near)), 1.0, "depth") if len(near) else (_USUAL, 0.0, "size")]
-    return [Root(_behind_surface(np.append(_center(ray, z) * z, z)), share, kind) for z, share, kind in places]
+    return [
+        Root(_behind_surface(np.append(_center(ray, z) * z, z)), share, kind, stands if kind == "size" else None)
+        for z, share, kind in places
+    ]
 
 
 def _behind_surface(point: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:

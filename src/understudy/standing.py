@@ -11,12 +11,14 @@ import numpy as np
 from jaxtyping import Float
 from scipy.special import logsumexp
 
-from understudy.apparent_size import LOG_DISTANCES
+from understudy.apparent_size import LOG_DISTANCES, distance_of
 from understudy.floor import Floor
 from understudy.skeleton import JOINTS, TORSO
 
 HEIGHT_SIGMA: Final = 0.07
 """metres: one sigma of a joint's height about that of the most alike of the known people"""
+NETWORK_SIGMA: Final = 0.10
+"""of the log of the distance at which the network puts somebody whom the depth camera did not measure"""
 
 _PARTS = ("nose", "neck", "shoulder", "hip", "knee", "ankle")
 _USED = np.array([i for i, n in enumerate(JOINTS) if n.split("_")[-1] in _PARTS])
@@ -53,6 +55,17 @@ def floor_log_likelihood(ray: Float[np.ndarray, "18 2"], floor: Floor) -> Float[
     each = np.log(density).sum(2) + n * np.log(along)[:, None]
     likely: Float[np.ndarray, "140"] = n**_POWER * logsumexp(each, axis=1)
     return likely
+
+
+def stood(joints: Float[np.ndarray, "18 3"], stands: Float[np.ndarray, "140"]) -> Float[np.ndarray, "18 3"]:
+    """A person (metres, colour camera's frame) as far away as both the floor and the network say.
+
+    stands: `floor_log_likelihood`. The network, which knows the floor only through the root, goes by how large people
+    are; to its distance, `NETWORK_SIGMA` is one sigma. All joints move along their rays, so the person grows or shrinks.
+    """
+    trunk = float(np.linalg.norm(joints[TORSO].mean(0)))
+    distance, _ = distance_of(stands - 0.5 * ((LOG_DISTANCES - np.log(trunk)) / NETWORK_SIGMA) ** 2)
+    return joints * (distance / trunk)
 
 
 def _level(points: Float[np.ndarray, "n 3"], floor: Floor) -> Float[np.ndarray, " n"]:

@@ -20,6 +20,7 @@ from understudy.errors import UnderstudyError, one_of
 from understudy.floor import Floor, measured_floor
 from understudy.roots import Root, find_roots
 from understudy.skeleton import TORSO
+from understudy.standing import stood
 from understudy.types import INFERRED, OBSERVED, Keypoints2D, Person, RegisteredFrame
 from understudy.voxelposenet.predictor import Prediction, Predictor, keypoint_input
 from understudy.voxels import PersonView
@@ -74,6 +75,8 @@ class VoxelLifter:
 
     def _person(self, seen: Keypoints2D, root: Root, view: PersonView, rows: Rows, said: Prediction) -> Person:
         joints = view.to_cam(self._assemble(said, rows, view))
+        if root.stands is not None:
+            joints = stood(joints, root.stands)
         observed = (said.seen > 0.5) & (rows[:, 2] > 0) & (root.evidence == "depth")
         source = np.where(observed, OBSERVED, INFERRED)
         return Person(seen, joints, said.confidence, said.sigma, tuple(source.tolist()))
