@@ -27,7 +27,7 @@ from understudy.hands.crop import (
     arm_context,
     crop_rotation,
 )
-from understudy.hands.estimator import hypotheses, supported, within_10_cm, wrist_of
+from understudy.hands.estimator import supported, within_10_cm, wrist_of
 from understudy.hands.predictor import HandPrediction, HandPredictor, color_word, pooled
 from understudy.skeleton import JOINT, N_JOINTS
 from understudy.types import Keypoints2D, Person, RegisteredDepth, RegisteredFrame, Wrist
@@ -355,21 +355,34 @@ def test_within_10_cm_is_the_share_of_normal_errors() -> None:
     assert 0.95 < sure.confidence <= 1 and unsure.confidence == within_10_cm(unsure.sigma_m)
 
 
-def test_hand_is_looked_for_as_far_as_the_wrist_is_uncertain() -> None:
+@pytest.mark.parametrize(("sigma", "looks"), [(0.02, 1), (0.15, 2), (np.nan, 2)])
+def test_unsure_wrists_are_looked_at_again_where_they_were_found(sigma: float, looks: int) -> None:
     joints = skeleton(7) - [0.2, 0, 0]
-    known, unknown, lost = (replace(person(joints), sigma_m=np.full(N_JOINTS, s)) for s in (0.02, 0.15, 5.0))
-    assert len(hypotheses(known, "left")) == 1
-    several = hypotheses(unknown, "left")
-    assert len(several) == 5
-    wrists = np.stack([view.to_cam(view.context)[0] for view in several])
-    np.testing.assert_allclose(wrists[0], joints[JOINT["left_wrist"]])
-    np.testing.assert_allclose(wrists[1:].mean(axis=0), wrists[0], atol=1e-9)
-    np.testing.assert_allclose(np.linalg.norm(wrists[1:] - wrists[0], axis=1), 1.5 * 0.15 / 1.87, rtol=1e-6)
-    far = np.stack([view.to_cam(view.context)[0] for view in hypotheses(lost, "left")])
-    assert np.linalg.norm(far - far[0], axis=1).max() < 0.2
-    no_arm = joints.copy()
-    no_arm[JOINT["left_wrist"]] = np.nan
-    assert hypotheses(person(no_arm), "left") == []
+    row = JOINT["left_wrist"]
+    joints[row] = [0.1, 0.05, 2.4]
+    found = joints[row] + [0.06, 0.02, -0.05]
+    asked: list[list[HandView]] = []
+
+    def says(views: list[HandView], *crops: object) -> list[HandPrediction]:
+        asked.append(list(views))
+        word = _word([0, 0, 1] if len(asked) == 1 else [0, 1, 0], 0.5)
+        return [replace(word, landmarks=np.tile(found, (21, 1)))] * len(views)
+
+    camera = Camera(64, 48, np.array([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]]))
+    depth = RegisteredDepth(np.full((48, 64), 2.4, np.float32), camera)
+    frame = RegisteredFrame(np.zeros((48, 64, 3), np.uint8), camera, depth)
+    estimator = HandNormalEstimator(color=False)
+    estimator.predictor = says  # type: ignore[assignment]
+    who = replace(person(joints), sigma_m=np.full(N_JOINTS, sigma))
+    who.keypoints[JOINT["right_wrist"]] = np.nan
+    hands = estimator.estimate(frame, who)
+    wrists = [[view.to_cam(view.context)[0] for view in views] for views in asked]
+    assert len(asked) == looks and all(len(w) == 1 for w in wrists)
+    np.testing.assert_allclose(wrists[0][0], joints[row])
+    np.testing.assert_allclose(wrists[-1][0], found if looks == 2 else joints[row])
+    assert hands.left is not None and hands.right is None
+    pooled_normal = [0, 0, 1] if looks == 1 else [0, 0.5**0.5, 0.5**0.5]
+    np.testing.assert_allclose(hands.left.normal, pooled_normal, atol=1e-9)
 
 
 # -- what it reaches -----------------------------------------------------------------------------------------------

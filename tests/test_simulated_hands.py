@@ -12,7 +12,7 @@ pytest.importorskip("anny")
 
 from scipy.spatial.transform import Rotation  # noqa: E402
 
-from understudy.errors import UnderstudyError  # noqa: E402
+from understudy.errors import ModelFileError, UnderstudyError  # noqa: E402
 from understudy.hands import pool as pools  # noqa: E402
 from understudy.hands.crop import CELL, EMPTY, GREY, PIXEL, PIXELS, HandView, crop_rotation  # noqa: E402
 from understudy.hands.net import HandNormalNet, loss, von_mises_fisher  # noqa: E402
@@ -22,7 +22,7 @@ from understudy.skeleton import HAND_KEYPOINTS  # noqa: E402
 from understudy.synthetic.bodies import load_bank  # noqa: E402
 from understudy.synthetic.draw import Draw  # noqa: E402
 from understudy.synthetic.hand_bank import FOREARM, articulate, load_hands, palm_normals, shortest_turn  # noqa: E402
-from understudy.synthetic.hand_clothes import SKIN  # noqa: E402
+from understudy.synthetic.hand_clothes import LOWER, SKIN, UPPER, ClothesConfig, dress_hands  # noqa: E402
 from understudy.synthetic.hand_color import color_words  # noqa: E402
 from understudy.synthetic.hand_crops import crop_rotation as torch_crop_rotation  # noqa: E402
 from understudy.synthetic.hand_crops import depth_crop  # noqa: E402
@@ -227,6 +227,44 @@ def test_splat_knows_the_point_that_is_seen():
         assert 0 <= u - corner[0].floor() <= 1 and 0 <= v - corner[1].floor() <= 1
 
 
+def test_pockets_begin_at_an_edge_and_hide_what_is_beyond(bank):
+    """Sleeves cover forearms, pockets the fingers' side; cloth is between a hand without a shape and the camera."""
+    b = 400
+    along = bank.points[torch.zeros(b, dtype=torch.long), :, 0]
+    to_camera = torch.nn.functional.normalize(torch.randn(b, 3, generator=torch.Generator().manual_seed(0)), dim=1)
+    empty = torch.arange(b) % 2 == 0
+    config = ClothesConfig(sleeves=0.5, pockets=0.5, pockets_at_hips=1.0)
+    worn = dress_hands(Draw(1), config, along, bank.of_hand, empty, torch.full((b,), 0.1), to_camera)
+    assert not worn.pocketed[~empty].any() and worn.pocketed[empty].any(1).float().mean() > 0.95
+    assert not worn.pocketed[:, ~bank.of_hand].any()
+    some = worn.pocketed.any(1)
+    least = torch.where(worn.pocketed, along, 9.0).amin(1)[some]
+    bare = bank.of_hand & ~worn.pocketed[some]
+    assert (torch.where(bare, along[some], -9.0).amax(1) <= least).all()
+    assert (bare.any(1)).float().mean() > 0.5
+    assert (worn.wear[worn.pocketed] != SKIN).all() and (worn.wear == LOWER).any() and (worn.wear == UPPER).any()
+    assert ((worn.thick == 0) == (worn.wear == SKIN)).all()
+    flat = worn.patch.there
+    assert torch.equal(flat, worn.thick.isnan().any(1))
+    across = to_camera * torch.tensor([0.0, 1.0, 1.0])
+    fingers = torch.tensor([0.13, 0.0, 0.0])  # a place on the fingers: the cloth is before it
+    gap = ((worn.patch.center - fingers) * worn.patch.axes[:, 2]).sum(1)
+    facing = (torch.nn.functional.normalize(across, dim=1) * worn.patch.axes[:, 2]).sum(1)
+    easy = flat & (across.norm(dim=1) > 0.6)
+    assert (facing[easy] > 0.3).float().mean() > 0.95 and (gap[easy] > 0).float().mean() > 0.8
+
+
+def test_boards_of_one_batch_under_those_of_another():
+    draw, grips = Draw(2), draw_grips(Draw(1), GripConfig(), torch.zeros(8))
+    first, second = (draw_board(draw, GripConfig(handle=h, lies=h), grips) for h in (1.0, 0.3))
+    both = first.under(second)
+    assert torch.equal(both.there, first.there | second.there)
+    for name in ("center", "axes", "half"):
+        mine, own, other = (getattr(x, name) for x in (both, first, second))
+        assert torch.equal(mine[second.there], other[second.there])
+        assert torch.equal(mine[~second.there], own[~second.there])
+
+
 def test_images_show_the_hand_where_it_is():
     """A square of skin, half of it behind a box: its colour is where its points are, and not where the box is."""
     step = torch.linspace(-0.05, 0.05, 60)
@@ -350,6 +388,18 @@ def _filled(config: HandTrainConfig, out: Path, monkeypatch: pytest.MonkeyPatch)
     for pool in trainer.pools():
         pool.fill()
     return trainer
+
+
+def test_training_begins_with_given_weights(tiny, tmp_path, monkeypatch):
+    given = _filled(tiny, tmp_path / "a", monkeypatch)
+    given.run()
+    path = tmp_path / "a" / "weights.safetensors"
+    on = HandTrainer(replace(tiny, init=str(path)), tmp_path / "b")
+    for name, value in given.average.items():
+        assert torch.equal(on.net.state_dict()[name], value), name
+    (tmp_path / "bad.safetensors").write_bytes(b"no weights")
+    with pytest.raises(ModelFileError, match="bad.safetensors: not readable weights"):
+        HandTrainer(replace(tiny, init=str(tmp_path / "bad.safetensors")), tmp_path / "c")
 
 
 def test_training_learns_resumes_and_refuses_other_settings(tiny, tmp_path, monkeypatch):

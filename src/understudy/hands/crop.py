@@ -139,12 +139,9 @@ class HandView:
         small: np.ndarray = cv2.resize(seen, (PIXELS, PIXELS), interpolation=cv2.INTER_AREA)
         return small
 
-    def points_near(self, depth: RegisteredDepth, margin: float = 0.0) -> Float[np.ndarray, "n 3"]:
-        """The measured points that `depth_crop` needs: those in the crop's part of the image.
-
-        margin: also those that views whose centres are up to so many metres away need.
-        """
-        part = image_part(depth.camera, self.center, 1.5 * HALF + margin)
+    def points_near(self, depth: RegisteredDepth) -> Float[np.ndarray, "n 3"]:
+        """The measured points that `depth_crop` needs: those in the crop's part of the image."""
+        part = image_part(depth.camera, self.center, 1.5 * HALF)
         z = depth.z[part]
         rays = pixel_rays(depth.camera)[(slice(None), *part)]
         measured = z > 0

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
 import numpy as np
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Float, Float32
 from scipy.stats import chi
 
 from understudy.camera import Camera
@@ -21,7 +21,9 @@ from understudy.hands.predictor import HandPrediction, HandPredictor, color_word
 from understudy.registration import register
 from understudy.skeleton import JOINT
 from understudy.types import OBSERVED, Frame, Hands, Palm, Person, RegisteredFrame, Wrist
-from understudy.voxels import rotation_to
+
+DepthCrop = Float32[np.ndarray, "2 48 48"]
+"""see `HandView.depth_crop`"""
 
 LEAST_CONFIDENCE: Final = 0.18
 """Palms below are left out."""
@@ -29,9 +31,7 @@ LEAST_CONFIDENCE: Final = 0.18
 _WRIST_SIGMA = ([0.15, 0.4, 0.6, 0.8, 0.94, 0.99], [0.10, 0.085, 0.070, 0.052, 0.042, 0.030])
 """confidence of a palm -> radius (metres) that holds 68 % of the wrist's errors: 1.3 times that of simulated hands"""
 _BALL = 1.87  # radius that holds 68 % of a normal distribution in space, in sigmas along an axis
-_SIGMA_LEAST, _SIGMA_MOST = 0.03, 0.12  # metres along an axis: of wrists that are looked for in several places
-_STEP = 1.5  # sigmas from the middle to the other places
-_TETRAHEDRON = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / np.sqrt(3)  # across, down, along the view
+_SURE = 0.03 * _BALL  # metres: sigma of a wrist below which one look is enough
 _AGREE = np.radians(35)  # the colour path's joints are used where its normal is so near to the result
 _NEIGHBOURS = np.arange(3)  # cells around a keypoint's, in a crop with a rim
 _BEFORE, _BEHIND = 0.03, 0.05  # metres: a keypoint is supported by a surface from so far before to so far behind it
@@ -42,12 +42,12 @@ class HandNormalEstimator:
     """Which way the palms of an estimated person face, in the colour camera's frame.
 
     1. `HandView`: where the body says that a hand is, how large and how turned; left or right is the body's word.
-    2. `HandView.depth_crop`, `color_crop`: depth and colour around the hand; several crops, as far apart as the wrist
-       is uncertain.
+    2. `HandView.depth_crop`, `color_crop`: depth and colour around the hand.
     3. `ColorPath`: where the wrist is seen, palm detection and hand landmarks on larger crops of the colour image
        (optional).
     4. `HandPredictor`: a network that is told all this, and the body's joints, trained to weigh it; where the fingers
-       cannot be seen, what the forearm and the posture make likely is left. `pooled` joins what it says of the crops.
+       cannot be seen, what the forearm and the posture make likely is left.
+    5. A second look where the network found the wrist, if the skeleton was not sure of it; `pooled` joins both.
     """
 
     def __init__(
@@ -83,57 +83,71 @@ class HandNormalEstimator:
         places = [self._views(registered.camera, person) for person in people]
         seen = [self._color_palms(registered, person, views) for person, (views, _) in zip(people, places, strict=True)]
         hands = [
-            _Hand(i, side, several, *_crops(registered, several, self.color), seen[i].get(side))
+            _Hand(i, side, people[i], view, seen[i].get(side))
             for i, (views, _) in enumerate(places)
-            for side, several in views.items()
+            for side, view in views.items()
         ]
-        words = self._predict(hands)
+        looks = self._looks(registered, hands)
+        words = self._with_second_looks(registered, hands, [word for _, word in looks])
         palms: list[dict[str, Palm]] = [{} for _ in people]
         wrists: list[dict[str, Wrist]] = [{} for _ in people]
-        for hand, word in zip(hands, words, strict=True):
+        for hand, word, (crop, _) in zip(hands, words, looks, strict=True):
             wrists[hand.person][hand.side] = wrist_of(word)
             if word.confidence < self.least_confidence:
                 why = f"too unsure: within 30 degrees with a probability of {word.confidence:.2f} only"
                 places[hand.person][1][hand.side] = why
             else:
-                palms[hand.person][hand.side] = hand.palm(registered.camera, word)
+                palms[hand.person][hand.side] = hand.palm(registered.camera, word, crop)
         return [
             Hands(p.get("left"), p.get("right"), why, w) for p, w, (_, why) in zip(palms, wrists, places, strict=True)
         ]
 
     def _color_palms(
-        self, frame: RegisteredFrame, person: Person, views: dict[str, list[HandView]]
+        self, frame: RegisteredFrame, person: Person, views: dict[str, HandView]
     ) -> dict[str, ColorPalm | None]:
         if self.color_path is None or not views:
             return {}
         seen = [side for side in views if person.source[JOINT[f"{side}_wrist"]] == OBSERVED]
         return self.color_path.estimate(frame, person, seen)
 
-    def _predict(self, hands: Sequence[_Hand]) -> list[HandPrediction]:
-        """Of each hand, from all its views."""
+    def _looks(self, frame: RegisteredFrame, hands: Sequence[_Hand]) -> list[tuple[DepthCrop, HandPrediction]]:
+        """Of each hand, its depth crop and what the network says."""
         if not hands:
             return []
-        color = np.stack([color_word(view, hand.color) for hand in hands for view in hand.views])
-        views = [v for hand in hands for v in hand.views]
-        depth, image = (np.concatenate([getattr(h, name) for h in hands]) for name in ("crops", "images"))
-        said = iter(self.predictor(views, depth, color, image))
-        return [pooled([next(said) for _ in hand.views]) for hand in hands]
+        views = [hand.view for hand in hands]
+        depth = np.stack([view.depth_crop(view.points_near(frame.depth)) for view in views])
+        if self.color:
+            image = np.stack([view.color_crop(frame.camera, frame.color) for view in views])
+        else:
+            image = np.full((len(views), PIXELS, PIXELS, 3), GREY, np.uint8)
+        color = np.stack([color_word(hand.view, hand.color) for hand in hands])
+        return list(zip(depth, self.predictor(views, depth, color, image), strict=True))
 
-    def _views(self, camera: Camera, person: Person) -> tuple[dict[str, list[HandView]], dict[str, str]]:
-        """The views of each hand, or why there are none."""
-        views: dict[str, list[HandView]] = {}
+    def _with_second_looks(
+        self, frame: RegisteredFrame, hands: Sequence[_Hand], words: Sequence[HandPrediction]
+    ) -> list[HandPrediction]:
+        """Wrists of which the skeleton was not sure are looked at again, where the network found them."""
+        out = list(words)
+        again = [(k, moved) for k, hand in enumerate(hands) if hand.unsure and (moved := hand.at(out[k])) is not None]
+        for (k, _), (_, word) in zip(again, self._looks(frame, [hand for _, hand in again]), strict=True):
+            out[k] = pooled([out[k], word])
+        return out
+
+    def _views(self, camera: Camera, person: Person) -> tuple[dict[str, HandView], dict[str, str]]:
+        """The view of each hand, or why there is none."""
+        views: dict[str, HandView] = {}
         why: dict[str, str] = {}
         for side in SIDES:
             if person.failed is not None:
                 why[side] = f"the person has no 3D joints: {person.failed}"
                 continue
-            several = hypotheses(person, side)
-            if not several:
+            view = HandView.of(person.keypoints, side, person.sigma_m)
+            if view is None:
                 why[side] = "the wrist or the elbow has no 3D position"
             elif not camera.contains(camera.project(person.keypoints[[JOINT[f"{side}_wrist"]]])).all():
                 why[side] = "the wrist is outside the colour image"
             else:
-                views[side] = several
+                views[side] = view
         return views, why
 
 
@@ -150,38 +164,6 @@ def within_10_cm(sigma_m: float) -> float:
     return float(chi.cdf(0.1 * _BALL / sigma_m, 3))
 
 
-def hypotheses(person: Person, side: str) -> list[HandView]:
-    """Views of where a hand may be: where the wrist is believed to be, then at the corners of a tetrahedron around it,
-    as large as its sigma says; a wrist that is known well enough has the first only. None without an arm.
-    """
-    row = JOINT[f"{side}_wrist"]
-    first = HandView.of(person.keypoints, side, person.sigma_m)
-    if first is None:
-        return []
-    sigma = min(float(np.nan_to_num(person.sigma_m[row], nan=_SIGMA_MOST)) / _BALL, _SIGMA_MOST)
-    if sigma < _SIGMA_LEAST:
-        return [first]
-    mirror = np.array([1.0 if side == "right" else -1.0, 1.0, 1.0])  # of left hands, as in the views
-    ray = mirror * person.keypoints[row] / np.linalg.norm(person.keypoints[row])
-    steps = _STEP * sigma * _TETRAHEDRON @ rotation_to(ray) * mirror
-    moved = np.repeat(person.keypoints[None], len(steps), axis=0)
-    moved[:, row] += steps
-    return [first, *(view for joints in moved if (view := HandView.of(joints, side, person.sigma_m)) is not None)]
-
-
-def _crops(
-    frame: RegisteredFrame, views: Sequence[HandView], color: bool
-) -> tuple[Float32[np.ndarray, "n 2 48 48"], UInt8[np.ndarray, "n 72 72 3"]]:
-    """The crops of depth and colour image of several views of one hand; the latter GREY when it is not to be used."""
-    apart = max(float(np.linalg.norm(view.center - views[0].center)) for view in views)
-    cloud = views[0].points_near(frame.depth, apart)
-    if color:
-        images = np.stack([view.color_crop(frame.camera, frame.color) for view in views])
-    else:
-        images = np.full((len(views), PIXELS, PIXELS, 3), GREY, np.uint8)
-    return np.stack([view.depth_crop(cloud) for view in views]), images
-
-
 @dataclass(frozen=True, eq=False)
 class _Hand:
     """One hand that is looked at."""
@@ -189,25 +171,36 @@ class _Hand:
     person: int
     """number in the list of people"""
     side: str
-    views: list[HandView]
-    crops: Float32[np.ndarray, "n 2 48 48"]
-    images: UInt8[np.ndarray, "n 72 72 3"]
+    of: Person
+    view: HandView
     color: ColorPalm | None
     """what the colour path says, where it found the palm"""
 
-    def palm(self, camera: Camera, word: HandPrediction) -> Palm:
-        """The result, from the pooled prediction."""
+    @property
+    def unsure(self) -> bool:
+        """Whether the skeleton's wrist may be elsewhere."""
+        return not self.of.sigma_m[JOINT[f"{self.side}_wrist"]] < _SURE  # NaN counts
+
+    def at(self, word: HandPrediction) -> _Hand | None:
+        """The same hand with its wrist where the network found it; None where it cannot be there."""
+        joints = self.of.keypoints.copy()
+        joints[JOINT[f"{self.side}_wrist"]] = word.landmarks[0]
+        view = HandView.of(joints, self.side, self.of.sigma_m)
+        return None if view is None else replace(self, view=view)
+
+    def palm(self, camera: Camera, word: HandPrediction, crop: DepthCrop) -> Palm:
+        """The result, from the pooled prediction. crop: of the first look."""
         projected = np.nan_to_num(camera.project(word.landmarks))
         score = np.where(camera.contains(projected), _PROJECTED_SCORE * word.confidence, 0.0)
         keypoints_2d = np.column_stack([projected, score])
         if self.color is not None and np.arccos(np.clip(self.color.normal @ word.normal, -1, 1)) < _AGREE:
             keypoints_2d = self.color.keypoints_2d
-        there = supported(self.views[0], self.crops[0], word.landmarks)
+        there = supported(self.view, crop, word.landmarks)
         keypoints = np.where(there[:, None], word.landmarks, np.nan)
         return Palm(word.normal, word.confidence, word.direction, keypoints, keypoints_2d)
 
 
-def supported(view: HandView, crop: Float32[np.ndarray, "2 48 48"], landmarks: Float[np.ndarray, "n 3"]) -> np.ndarray:
+def supported(view: HandView, crop: DepthCrop, landmarks: Float[np.ndarray, "n 3"]) -> np.ndarray:
     """Which keypoints (metres, colour camera's frame) have a measured surface in front of them or beside them, at about
     their depth; bool (n,). crop: `view.depth_crop`.
     """

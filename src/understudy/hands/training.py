@@ -15,6 +15,7 @@ import math
 import sys
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
@@ -187,9 +188,12 @@ class HandTrainer:
         start, seconds = time.monotonic(), self.seconds
         sums: dict[str, float] = {}
         since = 0
-        with Stop() as stop:
+        with Stop() as stop, ThreadPoolExecutor(1) as beside:
+            made = beside.submit(self._made, self.step, train, usable)
             while self.step < self.steps:
-                parts = self._learn(self._draw(train, usable))
+                batch = made.result()
+                made = beside.submit(self._made, self.step + 1, train, usable)  # while this one is learnt
+                parts = self._learn(*batch)
                 self.step += 1
                 since += 1
                 self.seconds = seconds + time.monotonic() - start
@@ -218,21 +222,25 @@ class HandTrainer:
                     report(row)
         return self.averaged()
 
-    def _draw(self, pool: HandBatch, usable: Tensor) -> HandBatch:
-        """The hands of the step: epoch by epoch, each in an order of its own."""
+    def _made(self, step: int, pool: HandBatch, usable: Tensor) -> tuple[HandBatch, tuple[Tensor, ...]]:
+        """The hands of a step, and what the network is given of them."""
+        draw = Draw(self.config.seed * 7919 + step)
+        batch = varied(draw, self._drawn(step, pool, usable))
+        return batch, inputs(batch, colored(draw, batch))
+
+    def _drawn(self, step: int, pool: HandBatch, usable: Tensor) -> HandBatch:
+        """Epoch by epoch, each in an order of its own."""
         per_epoch = len(usable) // self.config.batch
-        epoch, place = divmod(self.step, per_epoch)
+        epoch, place = divmod(step, per_epoch)
         generator = torch.Generator().manual_seed(self.config.seed * 1009 + epoch)
         order = usable[torch.randperm(len(usable), generator=generator)]
         rows = order[place * self.config.batch : (place + 1) * self.config.batch]
         return HandBatch(*(t[rows] for t in pool))
 
-    def _learn(self, batch: HandBatch) -> dict[str, Tensor]:
+    def _learn(self, batch: HandBatch, given: tuple[Tensor, ...]) -> dict[str, Tensor]:
         self.net.train()
-        draw = Draw(self.config.seed * 7919 + self.step)
-        batch = varied(draw, batch)
         with torch.autocast("cpu", torch.bfloat16, enabled=self.config.bf16):
-            said = self.net(*inputs(batch, colored(draw, batch)))
+            said = self.net(*given)
         output = HandOutput(*(part.float() for part in said))
         total, parts = loss(output, batch.normal, batch.direction, batch.landmarks)
         self.optimizers.zero_grad()
