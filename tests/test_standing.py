@@ -107,5 +107,5 @@ def test_between_the_network_and_the_floor(floor_sigma: float):
     trunk = np.linalg.norm(joints[TORSO].mean(0))
     says = np.log(trunk) + 0.15
     out = stood(joints, -0.5 * ((LOG_DISTANCES - says) / floor_sigma) ** 2)
-    share = 1 / floor_sigma ** 2 / (1 / floor_sigma ** 2 + 1 / 0.10**2)
+    share = 1 / floor_sigma**2 / (1 / floor_sigma**2 + 1 / 0.10**2)
     assert np.allclose(out, joints * np.exp(0.15 * share), rtol=2e-3)

@@ -125,9 +125,7 @@ class HandTrainer:
         torch.manual_seed(config.seed)
         self.net = read_net(Path(config.init)) if config.init else HandNormalNet()
         self.net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # a fifth faster on a CPU
-        self.optimizers = Optimizers(
-            self.net, config.optimizer, config.learning_rate, config.weight_decay, _READERS
-        )
+        self.optimizers = Optimizers(self.net, config.optimizer, config.learning_rate, config.weight_decay, _READERS)
         self.average = {k: v.detach().clone() for k, v in self.net.state_dict().items()}
         self.step, self.seconds = 0, 0.0
         if record:
@@ -158,7 +156,9 @@ class HandTrainer:
                         "choose another folder, or delete that one"
                     )
         if (self.out / CHECKPOINT).exists():
-            self.step, self.seconds = load_checkpoint(self.out / CHECKPOINT, self.net, self.average, self.optimizers.each)
+            self.step, self.seconds = load_checkpoint(
+                self.out / CHECKPOINT, self.net, self.average, self.optimizers.each
+            )
         for name in (records.LOG, records.VALIDATION):
             records.keep_until(self.out / name, self.step)
         about = {"kind": KIND, "config": now, "command": sys.argv, "torch": torch.__version__}

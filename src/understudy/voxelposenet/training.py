@@ -89,7 +89,9 @@ class Trainer:
                     "delete that one"
                 )
         if (self.out / CHECKPOINT).exists():
-            self.step, self.seconds = load_checkpoint(self.out / CHECKPOINT, self.net, self.average, self.optimizers.each)
+            self.step, self.seconds = load_checkpoint(
+                self.out / CHECKPOINT, self.net, self.average, self.optimizers.each
+            )
             self._saved = self.step
         if self.world.size > 1:
             torch.distributed.barrier()  # all have read what the first one now writes
