@@ -13,16 +13,16 @@ from understudy.skeleton import JOINT, N_JOINTS
 from understudy.voxelposenet.predictor import Prediction
 from understudy.voxels import PersonView
 
-_SIGMA_2D = 0.05  # metres at the person: of a 2D keypoint with full score
+_SIGMA_2D = 0.04  # metres at the person: of a 2D keypoint with full score
 _SIGMA_UNSURE = 0.1  # more, for a score of 0
-_GATE = 2.0  # standard deviations beyond which 2D and network do not speak of the same place
+_GATE = 1.0  # standard deviations beyond which 2D and network do not speak of the same place
 
 _LIMBS = (("shoulder", "elbow", 0.282), ("elbow", "wrist", 0.26), ("hip", "knee", 0.403), ("knee", "ankle", 0.412))
 _ENDS = np.array([[JOINT[f"{s}_{a}"], JOINT[f"{s}_{b}"]] for a, b, _ in _LIMBS for s in ("right", "left")])
 _LENGTHS = np.array([length for *_, length in _LIMBS for _ in "rl"])  # metres, mean of adults (ANSUR II)
 _SIGMA_LENGTH = 0.12  # share of its length by which a bone differs from the mean
 _SIGMA_SIDES = 0.03  # share by which a bone differs from the other side's
-_SPREAD = 0.5  # the distribution's spread over the error's sigma that it stands for
+_SPREAD = 0.3  # the distribution's spread over the error's sigma that it stands for
 _ROUNDS = 4
 _LONGEST_STEP = 0.15  # metres
 
