@@ -17,7 +17,7 @@ from understudy.hands import pool as pools  # noqa: E402
 from understudy.hands.crop import CELL, EMPTY, GREY, PIXEL, PIXELS, HandView, crop_rotation  # noqa: E402
 from understudy.hands.net import HandNormalNet, loss, von_mises_fisher  # noqa: E402
 from understudy.hands.pool import HandPool, PoolConfig  # noqa: E402
-from understudy.hands.training import HandTrainConfig, HandTrainer, inputs, relit, varied  # noqa: E402
+from understudy.hands.training import HandTrainConfig, HandTrainer, _cut, inputs, relit, varied  # noqa: E402
 from understudy.skeleton import HAND_KEYPOINTS  # noqa: E402
 from understudy.synthetic.bodies import load_bank  # noqa: E402
 from understudy.synthetic.draw import Draw  # noqa: E402
@@ -28,7 +28,7 @@ from understudy.synthetic.hand_crops import crop_rotation as torch_crop_rotation
 from understudy.synthetic.hand_crops import depth_crop  # noqa: E402
 from understudy.synthetic.hand_grips import BAR, FREE, Board, GripConfig, draw_board, draw_grips, held_points  # noqa: E402
 from understudy.synthetic.hand_images import HandScene, hand_image  # noqa: E402
-from understudy.synthetic.hand_samples import HandBatch, HandSamples, turned  # noqa: E402
+from understudy.synthetic.hand_samples import HandBatch, HandConfig, HandSamples, turned  # noqa: E402
 from understudy.synthetic.render import FAR, pixel_rays, splat, splat_which  # noqa: E402
 
 STRAIGHT = torch.tensor([[-1.0, 0.0, 0.0]])
@@ -254,10 +254,47 @@ def test_pockets_begin_at_an_edge_and_hide_what_is_beyond(bank):
     assert (facing[easy] > 0.3).float().mean() > 0.95 and (gap[easy] > 0).float().mean() > 0.8
 
 
-def test_boards_of_one_batch_under_those_of_another():
+def test_pockets_hide_hands(bank):
+    bodies = load_bank("anny", 6, 77)
+
+    def batch(share: float) -> HandBatch:
+        config = HandConfig(clothes=ClothesConfig(pockets=share, pockets_at_hips=share), grips=GripConfig(holds=0.0))
+        return HandSamples(bodies, bank, config, seed=5).batch(0, 48)
+
+    bare, pocketed = batch(0.0), batch(1.0)
+    assert torch.equal(bare.normal, pocketed.normal) and not torch.equal(bare.image, pocketed.image)
+    assert (pocketed.visible <= bare.visible + 0.05).float().mean() > 0.95
+    assert float(pocketed.visible.mean()) < 0.6 * float(bare.visible.mean())
+
+
+def test_cloth_before_a_hand_has_the_wearers_colour():
+    """A board all over the image: of one colour with folds when it is cloth, of any otherwise."""
+    nothing = torch.full((40, 1, 3), torch.nan)
+    near, far = torch.full((40, PIXELS, PIXELS), 1.0), torch.full((40, PIXELS, PIXELS), FAR)
+    scene = HandScene(
+        nothing, nothing, torch.full((40, 1), SKIN), torch.tensor([[0.0, 0.0, 1.0]]).expand(40, 3), nothing, nothing,
+        torch.zeros(1, dtype=torch.long), far, near, torch.full((40,), LOWER), torch.full((40,), 2.0),
+        torch.full((40,), 0.001),
+    )  # fmt: skip
+    image = hand_image(Draw(3), scene).float().flatten(2)
+    assert float(image.mean(2).std(0).min()) > 20  # everybody wears something else
+    hue = image / image.sum(1, keepdim=True).clamp_min(1)
+    bright = image.mean((1, 2)) > 60  # noise hides the colour of black cloth
+    assert float(hue[bright].std(2).mean()) < 0.02
+
+
+def test_some_depth_ends_at_a_line():
+    gone = _cut(Draw(0), 2000)
+    cut = gone.flatten(1).any(1)
+    assert 0.08 < float(cut.float().mean()) < 0.16
+    share = gone[cut].float().mean((1, 2))
+    assert 0.4 < float(share.mean()) < 0.6 and float(share.max()) < 0.95
+
+
+def test_boards_of_one_batch_replaced_by_those_of_another():
     draw, grips = Draw(2), draw_grips(Draw(1), GripConfig(), torch.zeros(8))
     first, second = (draw_board(draw, GripConfig(handle=h, lies=h), grips) for h in (1.0, 0.3))
-    both = first.under(second)
+    both = first.replaced_by(second)
     assert torch.equal(both.there, first.there | second.there)
     for name in ("center", "axes", "half"):
         mine, own, other = (getattr(x, name) for x in (both, first, second))

@@ -1,5 +1,7 @@
 """Distance over a measured floor: right for drawn people, and better than the size alone for tall and short ones."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from test_apparent_size import BODY
@@ -10,7 +12,8 @@ from understudy.floor import Floor
 from understudy.roots import find_roots
 from understudy.skeleton import JOINT, JOINTS, N_JOINTS, TORSO
 from understudy.standing import floor_log_likelihood, stood
-from understudy.types import Keypoints2D, RegisteredDepth
+from understudy.types import Keypoints2D, RegisteredDepth, RegisteredFrame
+from understudy.voxel_lifting import VoxelLifter
 
 ANKLE, HIPS = 0.11, 0.79  # metres: ankles over the floor, hips over the ankles
 UP = np.array([0.0, -1.0, 0.0])
@@ -75,17 +78,22 @@ def test_nothing_to_go_by():
     assert floor_log_likelihood(rays(standing(3.0, 1.2)), Floor(steep @ UP, -1.2)) is None
 
 
-@pytest.mark.parametrize("size", [0.87, 1.0, 1.13])
-def test_a_root_outside_the_depth_image(size: float):
-    """The floor is measured, the person is not: as beside the narrower image of a Kinect's depth camera."""
-    camera, distance = 1.1, 3.0
-    points = standing(distance, camera, size)
+def beside_the_depth_image(size: float, camera: float = 1.1) -> tuple[np.ndarray, Keypoints2D, RegisteredDepth]:
+    """Joints, 2D keypoints, and the depth of a floor without the person: as beside the narrower image of a Kinect."""
+    points = standing(3.0, camera, size)
     v, _ = np.mgrid[0:540, 0:960].astype(np.float64)
     slope = (v - 269.5) / 540.7
     z = np.where(slope > 0.1, camera / np.maximum(slope, 0.1), 0.0)
     z[:, 380:580] = 0  # nothing around the person
-    depth = RegisteredDepth(z.astype(np.float32), CAMERA)
     who = Keypoints2D.where(CAMERA.project(points), np.full(N_JOINTS, 0.9))
+    return points, who, RegisteredDepth(z.astype(np.float32), CAMERA)
+
+
+@pytest.mark.parametrize("size", [0.87, 1.0, 1.13])
+def test_a_root_outside_the_depth_image(size: float):
+    """The floor is measured, the person is not."""
+    camera, distance = 1.1, 3.0
+    _, who, depth = beside_the_depth_image(size, camera)
     asked = []
 
     def floor() -> Floor:
@@ -96,7 +104,7 @@ def test_a_root_outside_the_depth_image(size: float):
     assert with_it.evidence == "size" and len(asked) == 1
     off = [abs(root.point[2] / distance - 1) for root in (without, with_it)]
     assert off[1] < 0.1
-    assert with_it.stands is not None and without.stands is None
+    assert with_it.floor_likelihood is not None and without.floor_likelihood is None
     assert size == 1.0 or off[1] < 0.7 * off[0]
 
 
@@ -109,3 +117,25 @@ def test_between_the_network_and_the_floor(floor_sigma: float):
     out = stood(joints, -0.5 * ((LOG_DISTANCES - says) / floor_sigma) ** 2)
     share = 1 / floor_sigma**2 / (1 / floor_sigma**2 + 1 / 0.10**2)
     assert np.allclose(out, joints * np.exp(0.15 * share), rtol=2e-3)
+
+
+def test_the_lifter_puts_who_was_not_measured_there(monkeypatch: pytest.MonkeyPatch):
+    """The last word on the distance is `stood`'s; nobody else is moved."""
+    _, who, depth = beside_the_depth_image(1.0)
+    frame = RegisteredFrame(np.zeros((CAMERA.height, CAMERA.width, 3), np.uint8), CAMERA, depth)
+    (before,) = VoxelLifter().lift(frame, [who])
+    moved: list[np.ndarray] = []
+
+    def away(joints: np.ndarray, floor_likelihood: np.ndarray) -> np.ndarray:
+        moved.append(joints)
+        return 1.5 * joints
+
+    monkeypatch.setattr("understudy.voxel_lifting.stood", away)
+    (after,) = VoxelLifter().lift(frame, [who])
+    assert len(moved) == 1
+    np.testing.assert_array_equal(after.keypoints, 1.5 * moved[0])
+    ratio = np.linalg.norm(after.keypoints, axis=1) / np.linalg.norm(before.keypoints, axis=1)
+    assert np.ptp(ratio) < 1e-9  # along the rays
+    wall = replace(depth, z=np.full_like(depth.z, 3.0))
+    VoxelLifter().lift(replace(frame, depth=wall), [who])
+    assert len(moved) == 1

@@ -99,7 +99,7 @@ def test_a_validation_that_was_missed_is_made_up_for(finished, tmp_path):
     assert [r["step"] for r in rows] == [8] and len(records.read(tmp_path / "validation.csv")) == 1
 
 
-@pytest.mark.parametrize("damage", ["cut", "empty", "text", "other", "names"])
+@pytest.mark.parametrize("damage", ["cut", "empty", "text", "other", "names", "half", "optimiser"])
 def test_damaged_checkpoint(finished, tmp_path, damage):
     for name in ("config.json", "checkpoint.safetensors"):
         (tmp_path / name).write_bytes((finished / name).read_bytes())
@@ -107,6 +107,13 @@ def test_damaged_checkpoint(finished, tmp_path, damage):
     content = path.read_bytes()
     if damage == "names":
         save_file({"elsewhere/a": torch.zeros(1)}, path, {"step": "3", "seconds": "1"})
+    elif damage == "half":  # without Muon's momentum
+        tensors = {k: v for k, v in load_file(path).items() if not k.startswith("optimizer2/")}
+        save_file(tensors, path, {"step": "3", "seconds": "1"})
+    elif damage == "optimiser":  # what another one remembers
+        tensors = load_file(path)
+        tensors["optimizer/0/exp_avg"] = torch.zeros(3, 3)
+        save_file(tensors, path, {"step": "3", "seconds": "1"})
     elif damage == "other":
         tensors = load_file(path)
         tensors["net/score.weight"] = torch.zeros(1, 2, 3)
@@ -126,6 +133,24 @@ def test_a_run_begins_with_given_weights(finished, tmp_path):
     other = replace(SMALL, init=str(given), net=replace(SMALL.net, lifted=3))
     with pytest.raises(ModelFileError, match=r"weights\.safetensors: .*lifted=2.* must be .*lifted=3"):
         Trainer(other, tmp_path / "other")
+
+
+def test_a_run_goes_on_without_the_weights_that_it_began_with(finished, tmp_path):
+    given = tmp_path / "given.safetensors"
+    given.write_bytes((finished / "weights.safetensors").read_bytes())
+    config = replace(SMALL, init=str(given), seed=5, steps=2)
+    Trainer(config, tmp_path / "run").run()
+    given.unlink()
+    assert Trainer(config, tmp_path / "run").step == 2
+
+
+def test_runs_from_before_muon_are_adamws(finished, tmp_path):
+    about = json.loads((finished / "config.json").read_text())
+    del about["config"]["optimizer"]
+    (tmp_path / "config.json").write_text(json.dumps(about))
+    assert read_config(tmp_path / "config.json").optimizer == "adamw"
+    (tmp_path / "fields.json").write_text('{"steps": 7}')
+    assert read_config(tmp_path / "fields.json").optimizer == "muon"
 
 
 def test_training_is_compiled_when_asked(tmp_path, monkeypatch):

@@ -54,7 +54,7 @@ class Root:
     """share of the votes, 0 to 1: depths at the person that agree with it, and how credible it makes the size"""
     evidence: str
     """`depth`, or `size`: no depth was near the person that its apparent size (and the floor under it) allows"""
-    stands: Float[np.ndarray, "140"] | None = None
+    floor_likelihood: Float[np.ndarray, "140"] | None = None
     """of `size`, where there is a floor: how likely the trunk is at each distance, see `standing`"""
 
 

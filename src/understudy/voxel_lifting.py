@@ -75,8 +75,8 @@ class VoxelLifter:
 
     def _person(self, seen: Keypoints2D, root: Root, view: PersonView, rows: Rows, said: Prediction) -> Person:
         joints = view.to_cam(self._assemble(said, rows, view))
-        if root.stands is not None:
-            joints = stood(joints, root.stands)
+        if root.floor_likelihood is not None:
+            joints = stood(joints, root.floor_likelihood)
         observed = (said.seen > 0.5) & (rows[:, 2] > 0) & (root.evidence == "depth")
         source = np.where(observed, OBSERVED, INFERRED)
         return Person(seen, joints, said.confidence, said.sigma, tuple(source.tolist()))

@@ -92,12 +92,12 @@ class HandNormalEstimator:
         palms: list[dict[str, Palm]] = [{} for _ in people]
         wrists: list[dict[str, Wrist]] = [{} for _ in people]
         for hand, word, (crop, _) in zip(hands, words, looks, strict=True):
-            wrists[hand.person][hand.side] = wrist_of(word)
+            wrists[hand.number][hand.side] = wrist_of(word)
             if word.confidence < self.least_confidence:
                 why = f"too unsure: within 30 degrees with a probability of {word.confidence:.2f} only"
-                places[hand.person][1][hand.side] = why
+                places[hand.number][1][hand.side] = why
             else:
-                palms[hand.person][hand.side] = hand.palm(registered.camera, word, crop)
+                palms[hand.number][hand.side] = hand.palm(registered.camera, word, crop)
         return [
             Hands(p.get("left"), p.get("right"), why, w) for p, w, (_, why) in zip(palms, wrists, places, strict=True)
         ]
@@ -168,10 +168,10 @@ def within_10_cm(sigma_m: float) -> float:
 class _Hand:
     """One hand that is looked at."""
 
-    person: int
-    """number in the list of people"""
+    number: int
+    """of the person in the list"""
     side: str
-    of: Person
+    person: Person
     view: HandView
     color: ColorPalm | None
     """what the colour path says, where it found the palm"""
@@ -179,13 +179,13 @@ class _Hand:
     @property
     def unsure(self) -> bool:
         """Whether the skeleton's wrist may be elsewhere."""
-        return not self.of.sigma_m[JOINT[f"{self.side}_wrist"]] < _SURE  # NaN counts
+        return not self.person.sigma_m[JOINT[f"{self.side}_wrist"]] < _SURE  # NaN counts
 
     def at(self, word: HandPrediction) -> _Hand | None:
         """The same hand with its wrist where the network found it; None where it cannot be there."""
-        joints = self.of.keypoints.copy()
+        joints = self.person.keypoints.copy()
         joints[JOINT[f"{self.side}_wrist"]] = word.landmarks[0]
-        view = HandView.of(joints, self.side, self.of.sigma_m)
+        view = HandView.of(joints, self.side, self.person.sigma_m)
         return None if view is None else replace(self, view=view)
 
     def palm(self, camera: Camera, word: HandPrediction, crop: DepthCrop) -> Palm:

@@ -123,7 +123,8 @@ class HandTrainer:
         """out: folder of the run. record: make it, or go on in it; otherwise it is only read."""
         self.config, self.out = config, Path(out)
         torch.manual_seed(config.seed)
-        self.net = read_net(Path(config.init)) if config.init else HandNormalNet()
+        begins = record and not (self.out / CHECKPOINT).exists()
+        self.net = read_net(Path(config.init)) if config.init and begins else HandNormalNet()
         self.net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # a fifth faster on a CPU
         self.optimizers = Optimizers(
             self.net, config.optimizer, config.learning_rate, config.weight_decay, _READERS, fused=True
@@ -191,10 +192,11 @@ class HandTrainer:
         sums: dict[str, float] = {}
         since = 0
         with Stop() as stop, ThreadPoolExecutor(1) as beside:
-            made = beside.submit(self._made, self.step, train, usable)
-            while self.step < self.steps:
+            made = beside.submit(self._made, self.step, train, usable) if self.step < self.steps else None
+            while made is not None:
                 batch = made.result()
-                made = beside.submit(self._made, self.step + 1, train, usable)  # while this one is learnt
+                more = self.step + 1 < self.steps
+                made = beside.submit(self._made, self.step + 1, train, usable) if more else None  # during this step
                 parts = self._learn(*batch)
                 self.step += 1
                 since += 1

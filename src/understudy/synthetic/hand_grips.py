@@ -67,8 +67,8 @@ class Board:
         """In another frame: p -> p @ rows + shift."""
         return Board((self.center[:, None] @ rows)[:, 0] + shift, self.axes @ rows, self.half, self.there)
 
-    def under(self, other: Board) -> Board:
-        """These, and the other ones where those are there."""
+    def replaced_by(self, other: Board) -> Board:
+        """The other ones where those are there, these elsewhere."""
         chosen = other.there
         center = torch.where(chosen[:, None], other.center, self.center)
         axes = torch.where(chosen[:, None, None], other.axes, self.axes)

@@ -263,7 +263,7 @@ class HandSamples:
             marks=hand.landmarks @ axes + wrist[:, None],
             normal=(palm_normals(hand.landmarks)[:, None] @ axes)[:, 0],
             direction=x,
-            board=replace(board, there=board.there & behind).under(clothes.patch).moved(axes, wrist),
+            board=replace(board, there=board.there & behind).replaced_by(clothes.patch).moved(axes, wrist),
             grip=grips.kind,
         )
 

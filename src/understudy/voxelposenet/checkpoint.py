@@ -82,6 +82,10 @@ def _restore(
     for name, tensor in tensors.items():
         part, _, rest = name.partition("/")
         parts.setdefault(part, {})[rest] = tensor
+    step = int(words["step"])
+    names = {"net", "average", *(name for name, _ in _named(optimizers))}
+    if set(parts) - names or (step and names - set(parts)):
+        raise ValueError(f"it has {', '.join(sorted(parts))}; must have {', '.join(sorted(names))}")
     net.load_state_dict(parts["net"])
     for k, v in parts["average"].items():
         average[k].copy_(v)
@@ -90,10 +94,12 @@ def _restore(
         state: dict[int, dict[str, Tensor]] = {}
         for key, tensor in parts.get(name, {}).items():
             i, _, k = key.partition("/")
+            if tensor.ndim and tensor.shape != parameters[int(i)].shape:
+                raise ValueError(f"{name}/{key} has the shape {tuple(tensor.shape)}, of another optimiser")
             state.setdefault(int(i), {})[k] = _laid_out_as(parameters[int(i)], tensor)
         if state:
             optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})
-    return int(words["step"]), float(words["seconds"])
+    return step, float(words["seconds"])
 
 
 def _named(optimizers: Sequence[torch.optim.Optimizer]) -> list[tuple[str, torch.optim.Optimizer]]:

@@ -58,7 +58,8 @@ class Optimizers:
 
 
 class KernelMuon(torch.optim.Muon):
-    """torch's Muon, which takes matrices, for kernels of any size: outputs x (inputs and taps).
+    """torch's Muon, which takes matrices, for kernels of any size: the first axis x all others (outputs x inputs and
+    taps; of transposed convolutions inputs x outputs and taps).
 
     The matrices share memory with the kernels, whose steps are as large as AdamW's would be.
     """

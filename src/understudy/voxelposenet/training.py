@@ -69,7 +69,7 @@ class Trainer:
         torch.manual_seed(config.seed)
         self.kind = kinds.make(config, self.world.device)
         self.net = self.kind.net
-        if config.init:
+        if config.init and not (self.out / CHECKPOINT).exists():
             self.kind.load(Path(config.init))
         self.optimizers = Optimizers(
             self.net, config.optimizer, config.learning_rate, config.weight_decay, self.kind.readers, fused=True
@@ -262,7 +262,7 @@ def read_config(path: Path, base: TrainConfig | None = None) -> TrainConfig:
     base: has what the file does not say. Raises UnderstudyError that names the file and the field.
     """
     data = read_json(path)
-    inner = data["config"] if isinstance(data.get("config"), dict) else data
+    inner = {"optimizer": "adamw", **data["config"]} if isinstance(data.get("config"), dict) else data  # before Muon
     return from_json(inner, base or TrainConfig(), str(path))
 
 
