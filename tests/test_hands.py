@@ -355,8 +355,8 @@ def test_within_10_cm_is_the_share_of_normal_errors() -> None:
     assert 0.95 < sure.confidence <= 1 and unsure.confidence == within_10_cm(unsure.sigma_m)
 
 
-@pytest.mark.parametrize(("sigma", "looks"), [(0.02, 1), (0.15, 2), (np.nan, 2)])
-def test_unsure_wrists_are_looked_at_again_where_they_were_found(sigma: float, looks: int) -> None:
+@pytest.mark.parametrize(("sigma", "sure", "looks"), [(0.02, 0.5, 1), (0.15, 0.5, 2), (np.nan, 0.5, 2), (0.15, 0.7, 1)])
+def test_unsure_wrists_are_looked_at_again_where_they_were_found(sigma: float, sure: float, looks: int) -> None:
     joints = skeleton(7) - [0.2, 0, 0]
     row = JOINT["left_wrist"]
     joints[row] = [0.1, 0.05, 2.4]
@@ -365,7 +365,7 @@ def test_unsure_wrists_are_looked_at_again_where_they_were_found(sigma: float, l
 
     def says(views: list[HandView], *crops: object) -> list[HandPrediction]:
         asked.append(list(views))
-        word = _word([0, 0, 1] if len(asked) == 1 else [0, 1, 0], 0.5)
+        word = _word([0, 0, 1] if len(asked) == 1 else [0, 1, 0], sure)
         return [replace(word, landmarks=np.tile(found, (21, 1)))] * len(views)
 
     camera = Camera(64, 48, np.array([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]]))

@@ -25,13 +25,13 @@ from understudy.types import OBSERVED, Frame, Hands, Palm, Person, RegisteredFra
 DepthCrop = Float32[np.ndarray, "2 48 48"]
 """see `HandView.depth_crop`"""
 
-LEAST_CONFIDENCE: Final = 0.18
+LEAST_CONFIDENCE: Final = 0.2
 """Palms below are left out."""
 
 _WRIST_SIGMA = ([0.15, 0.4, 0.6, 0.8, 0.94, 0.99], [0.10, 0.085, 0.070, 0.052, 0.042, 0.030])
 """confidence of a palm -> radius (metres) that holds 68 % of the wrist's errors: 1.3 times that of simulated hands"""
 _BALL = 1.87  # radius that holds 68 % of a normal distribution in space, in sigmas along an axis
-_SURE = 0.03 * _BALL  # metres: sigma of a wrist below which one look is enough
+_SURE, _CONFIDENT = 0.03 * _BALL, 0.6  # metres, sigma of a wrist below which one look is enough; confidence above which
 _AGREE = np.radians(35)  # the colour path's joints are used where its normal is so near to the result
 _NEIGHBOURS = np.arange(3)  # cells around a keypoint's, in a crop with a rim
 _BEFORE, _BEHIND = 0.03, 0.05  # metres: a keypoint is supported by a surface from so far before to so far behind it
@@ -47,7 +47,7 @@ class HandNormalEstimator:
        (optional).
     4. `HandPredictor`: a network that is told all this, and the body's joints, trained to weigh it; where the fingers
        cannot be seen, what the forearm and the posture make likely is left.
-    5. A second look where the network found the wrist, if the skeleton was not sure of it; `pooled` joins both.
+    5. A second look where the network found the wrist, if neither skeleton nor network is sure; `pooled` joins both.
     """
 
     def __init__(
@@ -126,9 +126,10 @@ class HandNormalEstimator:
     def _with_second_looks(
         self, frame: RegisteredFrame, hands: Sequence[_Hand], words: Sequence[HandPrediction]
     ) -> list[HandPrediction]:
-        """Wrists of which the skeleton was not sure are looked at again, where the network found them."""
+        """What neither skeleton nor network is sure of is looked at again, where the network found the wrist."""
         out = list(words)
-        again = [(k, moved) for k, hand in enumerate(hands) if hand.unsure and (moved := hand.at(out[k])) is not None]
+        doubtful = [k for k, hand in enumerate(hands) if hand.unsure and out[k].confidence < _CONFIDENT]
+        again = [(k, moved) for k in doubtful if (moved := hands[k].at(out[k])) is not None]
         for (k, _), (_, word) in zip(again, self._looks(frame, [hand for _, hand in again]), strict=True):
             out[k] = pooled([out[k], word])
         return out
