@@ -307,7 +307,7 @@ def test_exported_network_says_what_torch_says() -> None:
             torch.tensor(depth), context, torch.full((5, 1), view.distance), torch.tensor(color), sigma.float(), picture
         )
     for k, word in enumerate(said):
-        # noise in place of images makes the network's word a guess, which magnifies rounding: of real crops, 0.01 degrees
+        # noise in place of images makes the network guess, which magnifies rounding (real crops: 0.01 degrees)
         np.testing.assert_allclose(view.directions_from_cam(word.normal), out.normal[k].numpy(), atol=1e-2)
         np.testing.assert_allclose((word.landmarks - view.center) @ view.R.T, out.landmarks[k].numpy(), atol=1e-3)
         assert word.confidence == pytest.approx(float(out.sure[k].sigmoid()), abs=1e-3)
