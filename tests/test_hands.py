@@ -298,7 +298,8 @@ def test_exported_network_says_what_torch_says() -> None:
     view = HandView.of(skeleton(), "right")
     depth = np.stack([view.depth_crop(cloud_around(view, seed=k)) for k in range(5)])
     color = rng.normal(0, 0.5, (5, 9)).astype(np.float32)
-    image = rng.integers(0, 256, (5, PIXELS, PIXELS, 3)).astype(np.uint8)
+    # pure noise would make the network guess, and a guess magnifies rounding
+    image = np.clip(rng.normal(rng.uniform(60, 200, (5, 1, 1, 3)), 10, (5, PIXELS, PIXELS, 3)), 0, 255).astype(np.uint8)
     said = HandPredictor()([view] * 5, depth, color, image)
     context = torch.tensor(np.stack([view.context] * 5)).float()
     with torch.no_grad():
@@ -307,8 +308,7 @@ def test_exported_network_says_what_torch_says() -> None:
             torch.tensor(depth), context, torch.full((5, 1), view.distance), torch.tensor(color), sigma.float(), picture
         )
     for k, word in enumerate(said):
-        # noise in place of images makes the network guess, which magnifies rounding (real crops: 0.01 degrees)
-        np.testing.assert_allclose(view.directions_from_cam(word.normal), out.normal[k].numpy(), atol=1e-2)
+        np.testing.assert_allclose(view.directions_from_cam(word.normal), out.normal[k].numpy(), atol=1e-3)
         np.testing.assert_allclose((word.landmarks - view.center) @ view.R.T, out.landmarks[k].numpy(), atol=1e-3)
         assert word.confidence == pytest.approx(float(out.sure[k].sigmoid()), abs=1e-3)
 
