@@ -82,16 +82,21 @@ def find_roots(
     limbs = np.median(nearest_depths(depth, camera, uv[_LIMBS]), axis=1)
     measured = np.concatenate([trunk, [person.torso_z or np.nan], limbs])
     places = _elected(measured, *_unmeasured_depth(ray))
-    stands = None
+    floor_likelihood = None
     if any(kind == "size" for *_, kind in places) and (plane := floor()):
-        stands = floor_log_likelihood(ray, plane)
-        places = _elected(measured, *_unmeasured_depth(ray, stands))
+        floor_likelihood = floor_log_likelihood(ray, plane)
+        places = _elected(measured, *_unmeasured_depth(ray, floor_likelihood))
     if not places:  # nothing to measure the keypoints by: any depth is better than none
         values = nearest_depths(depth, camera, uv, k=1, radius=0.1)
         near = values[np.isfinite(values)]
         places = [(float(np.median(near)), 1.0, "depth") if len(near) else (_USUAL, 0.0, "size")]
     return [
-        Root(_behind_surface(np.append(_center(ray, z) * z, z)), share, kind, stands if kind == "size" else None)
+        Root(
+            _behind_surface(np.append(_center(ray, z) * z, z)),
+            share,
+            kind,
+            floor_likelihood if kind == "size" else None,
+        )
         for z, share, kind in places
     ]
 
@@ -106,12 +111,14 @@ def _on_trunk(uv: Float[np.ndarray, "18 2"]) -> Float[np.ndarray, "9 2"]:
     return np.where(_PLACES[..., None] > 0, _PLACES[..., None] * corners, 0.0).sum(1)
 
 
-def _unmeasured_depth(ray: Float[np.ndarray, "18 2"], stands: np.ndarray | None = None) -> tuple[float, float]:
+def _unmeasured_depth(
+    ray: Float[np.ndarray, "18 2"], floor_likelihood: np.ndarray | None = None
+) -> tuple[float, float]:
     """z of the trunk at the person's apparent distance, and one sigma of its log; NaN where nothing tells it.
 
-    stands: log likelihood of `LOG_DISTANCES` by what the floor says.
+    floor_likelihood: log likelihood of `LOG_DISTANCES` by what the floor says.
     """
-    said = [likely for likely in (size_log_likelihood(ray), stands) if likely is not None]
+    said = [likely for likely in (size_log_likelihood(ray), floor_likelihood) if likely is not None]
     if not said:
         return np.nan, np.nan
     distance, sigma = distance_of(np.sum(said, axis=0))

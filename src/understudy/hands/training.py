@@ -126,9 +126,7 @@ class HandTrainer:
         begins = record and not (self.out / CHECKPOINT).exists()
         self.net = read_net(Path(config.init)) if config.init and begins else HandNormalNet()
         self.net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # a fifth faster on a CPU
-        self.optimizers = Optimizers(
-            self.net, config.optimizer, config.learning_rate, config.weight_decay, _READERS, fused=True
-        )
+        self.optimizers = Optimizers(self.net, config.optimizer, config.learning_rate, config.weight_decay, _READERS)
         self.average = {k: v.detach().clone() for k, v in self.net.state_dict().items()}
         self.step, self.seconds = 0, 0.0
         if record:

@@ -72,7 +72,7 @@ class Trainer:
         if config.init and not (self.out / CHECKPOINT).exists():
             self.kind.load(Path(config.init))
         self.optimizers = Optimizers(
-            self.net, config.optimizer, config.learning_rate, config.weight_decay, self.kind.readers, fused=True
+            self.net, config.optimizer, config.learning_rate, config.weight_decay, self.kind.readers
         )
         self.average = {k: v.detach().clone() for k, v in self.net.state_dict().items()}
         self.step, self.seconds = 0, 0.0
