@@ -125,7 +125,8 @@ class Walls:
         joints = np.concatenate([xy, np.broadcast_to(wall[..., None] + 0.1, (b, N_JOINTS, 1))], -1).astype(np.float32)
         yes = torch.ones(b, N_JOINTS, dtype=torch.bool)
         data = (torch.from_numpy(np.ascontiguousarray(a)) for a in (depth, keypoints, np.full((b, 1), 3, "f4"), joints))
-        return Batch(*data, yes, ~yes, yes[:, 0], torch.zeros(b, 2))
+        *given, joints = data
+        return Batch(*given, torch.zeros(b, 4), joints, yes, ~yes, yes[:, 0], torch.zeros(b, 2))
 
 
 @pytest.fixture(scope="module")

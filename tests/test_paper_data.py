@@ -69,6 +69,7 @@ def batch_of(joints: np.ndarray, depth: RegisteredDepth, seen: Keypoints2D) -> B
     flags = torch.zeros(1, 18, dtype=torch.bool)
     return Batch(
         one(view.depth_grid(cloud(depth))), one(keypoint_input(view, CAMERA, seen, 0.0)), one(np.array([view.root_z])),
+        torch.zeros(1, 4),
         one(view.from_cam(joints)), ~flags, flags, flags[:, 0], torch.zeros(1, 2, dtype=torch.long),
     )  # fmt: skip
 

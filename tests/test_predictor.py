@@ -16,12 +16,13 @@ from safetensors.torch import load_file, save_file  # noqa: E402
 from understudy import recordings, runtime  # noqa: E402
 from understudy.cli import main  # noqa: E402
 from understudy.errors import ModelFileError, UnderstudyError  # noqa: E402
+from understudy.floor import CAMERA_UP, Floor  # noqa: E402
 from understudy.registration import register  # noqa: E402
 from understudy.types import Keypoints2D  # noqa: E402
 from understudy.voxel_lifting import VoxelLifter  # noqa: E402
 from understudy.voxelposenet import publish as publishing  # noqa: E402
 from understudy.voxelposenet.checkpoint import load_net, save_weights  # noqa: E402
-from understudy.voxelposenet.export import OUTPUTS, export_onnx  # noqa: E402
+from understudy.voxelposenet.export import INPUTS, OUTPUTS, export_onnx  # noqa: E402
 from understudy.voxelposenet.net import NetConfig, VoxelPoseNet  # noqa: E402
 from understudy.voxelposenet.predictor import Predictor, keypoint_input  # noqa: E402
 from understudy.voxelposenet.publish import publish  # noqa: E402
@@ -56,7 +57,8 @@ def inputs(b: int) -> dict[str, np.ndarray]:
     depth[:, :, rng.random((CELLS, CELLS)) < 0.3] = EMPTY
     keypoints = np.concatenate([rng.uniform(-0.8, 0.8, (b, 18, 2)), rng.random((b, 18, 1))], -1)
     keypoints[:, 4] = 0
-    arrays = {"depth": depth, "keypoints": keypoints, "root_z": rng.uniform(1, 5, (b, 1))}
+    floor = np.tile([0.0, -1.0, 0.0, 1.4], (b, 1)) * (np.arange(b) > 0)[:, None]  # of the first one, none
+    arrays = {"depth": depth, "keypoints": keypoints, "root_z": rng.uniform(1, 5, (b, 1)), "floor": floor}
     return {k: v.astype(np.float32) for k, v in arrays.items()}
 
 
@@ -65,7 +67,7 @@ def test_runtime_agrees_with_torch(net, exported):
     for b in (1, 2, 5):
         given = inputs(b)
         with torch.inference_mode():
-            expected = net(*(torch.tensor(given[k]) for k in ("depth", "keypoints", "root_z")))
+            expected = net(*(torch.tensor(given[k]) for k in INPUTS))
         for name, got, want in zip(OUTPUTS, network(**given), expected, strict=True):
             np.testing.assert_allclose(got, want.numpy(), atol=1e-4, err_msg=f"{name}, {b} people")
 
@@ -82,15 +84,33 @@ def test_predictor_reads_the_networks_numbers(net, exported):
     given = inputs(2)
     views = [PersonView.towards(np.array([0.3, 0.1, z])) for z in (2.0, 4.0)]
     given["root_z"] = np.array([[v.root_z] for v in views], np.float32)
+    floor = Floor(CAMERA_UP, -1.4)
+    given["floor"] = np.stack([v.floor_plane(floor) for v in views])
     predictor = Predictor(exported, threads=1)
-    said = predictor(views, given["depth"], given["keypoints"])
+    said = predictor(views, given["depth"], given["keypoints"], floor)
     with torch.inference_mode():
-        out = net(*(torch.tensor(given[k]) for k in ("depth", "keypoints", "root_z")))
+        out = net(*(torch.tensor(given[k]) for k in INPUTS))
     for i, person in enumerate(said):
         np.testing.assert_allclose(person.sigma, out.head[i, :, 0].exp(), rtol=1e-3)
         np.testing.assert_allclose(person.confidence, out.head[i, :, 1].sigmoid(), atol=1e-4)
         np.testing.assert_allclose(person.seen, out.head[i, :, 2].sigmoid(), atol=1e-4)
     assert predictor([], np.empty((0, 2, 64, 64), np.float32), np.empty((0, 18, 3), np.float32)) == []
+    without = predictor(views, given["depth"], given["keypoints"])
+    assert all((a.joints != b.joints).any() for a, b in zip(said, without, strict=True))
+
+
+def test_networks_without_a_floor_can_still_be_used(tmp_path):
+    old = VoxelPoseNet(replace(TINY, floor=False)).eval()
+    export_onnx(old, tmp_path / "old.onnx", half=False)
+    given = inputs(1)
+    view = PersonView.towards(np.array([0.0, 0.0, 2.5]))
+    said = Predictor(tmp_path / "old.onnx", threads=1)(
+        [view], given["depth"], given["keypoints"], Floor(CAMERA_UP, -1.0)
+    )
+    root_z = torch.full((1, 1), view.root_z)
+    with torch.inference_mode():
+        out = old(torch.tensor(given["depth"]), torch.tensor(given["keypoints"]), root_z, torch.zeros(1, 4))
+    np.testing.assert_allclose(said[0].joints, out.joints[0], atol=1e-4)
 
 
 # --- on a recording ---
@@ -185,11 +205,16 @@ def test_other_files_are_refused(net, tmp_path):
         with pytest.raises(ModelFileError, match=words):
             load_net(path)
 
-    about = {"format": "understudy-voxelposenet/1", "net": '{"channels": [8, 8, 8], "channels_2d": 8, "lifted": 2}'}
+    about = {
+        "format": "understudy-voxelposenet/1",
+        "net": '{"channels": [8, 8, 8], "channels_2d": 8, "lifted": 2, "floor": true}',
+    }
     refused("not a readable safetensors file")  # absent
     refused("format is None", good)
     refused("format is 'understudy.paper_net/1'", good, {"format": "understudy.paper_net/1", "variant": "paper"})
-    refused("do not fit", good, {**about, "net": '{"channels": [8, 8, 16], "channels_2d": 8, "lifted": 2}'})
+    refused(
+        "do not fit", good, {**about, "net": '{"channels": [8, 8, 16], "channels_2d": 8, "lifted": 2, "floor": true}'}
+    )
     refused("do not fit", good, {**about, "net": '{"wings": 2}'})
     refused("do not fit", good, {**about, "net": "["})
     refused("do not fit", good, {"format": about["format"]})

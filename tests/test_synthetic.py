@@ -263,6 +263,23 @@ def test_depth_grid_and_rotation_are_those_of_the_person_view():
         assert np.allclose(columns[front], person.from_cam(cloud[front]), atol=1e-4)
 
 
+def test_floors_are_measured_nearly_where_they_are():
+    """World z is the height above the floor, of most within centimetres; some see none."""
+    draw, b = Draw(3), 4000
+    center = torch.stack([torch.zeros(b), -draw.uniform(1, 6, b), draw.uniform(0.4, 2.4, b)], 1)
+    R = view.rotation_to(draw.normal(b, 3))
+    plane = view.draw_floor(draw, R, center)
+    none = (plane == 0).all(1)
+    assert none.float().mean() == pytest.approx(0.3, abs=0.03)
+    torch.testing.assert_close(plane[~none, :3].norm(dim=1), torch.ones(int((~none).sum())))
+    points = draw.normal(b, 8, 3) * torch.tensor([0.5, 0.5, 0.5])  # about the person
+    in_view = (points - center[:, None]) @ R.transpose(1, 2)
+    off = ((in_view * plane[:, None, :3]).sum(-1) + plane[:, 3:] - points[..., 2])[~none].abs()
+    assert off.median() < 0.03 and (off < 0.1).float().mean() > 0.85 and off.max() > 0.3
+    twice = [view.draw_floor(Draw(7), R, center) for _ in range(2)]
+    assert torch.equal(*twice)
+
+
 def test_speed_shares_out_the_whole_time(bank):
     speed = timing.measure(Samples(bank, SampleConfig(), 0), size=2, batches=2)
     assert sum(speed.ms.values()) == pytest.approx(1000 / speed.per_s)

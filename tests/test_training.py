@@ -21,8 +21,9 @@ from understudy.cli.common import needs_extra  # noqa: E402
 from understudy.errors import MissingExtraError, ModelFileError, UnderstudyError  # noqa: E402
 from understudy.skeleton import JOINTS  # noqa: E402
 from understudy.voxelposenet import records, validation  # noqa: E402
-from understudy.voxelposenet.checkpoint import load_net  # noqa: E402
+from understudy.voxelposenet.checkpoint import FORMAT, load_net, save_weights  # noqa: E402
 from understudy.voxelposenet.data import Batches  # noqa: E402
+from understudy.voxelposenet.net import VoxelPoseNet  # noqa: E402
 from understudy.voxelposenet.train_config import differences, from_json  # noqa: E402
 from understudy.voxelposenet.training import PRESETS, TrainConfig, Trainer, read_config  # noqa: E402
 
@@ -133,6 +134,35 @@ def test_a_run_begins_with_given_weights(finished, tmp_path):
     other = replace(SMALL, init=str(given), net=replace(SMALL.net, lifted=3))
     with pytest.raises(ModelFileError, match=r"weights\.safetensors: .*lifted=2.* must be .*lifted=3"):
         Trainer(other, tmp_path / "other")
+
+
+def test_a_network_without_the_floor_is_where_one_with_it_begins(tmp_path):
+    """At first it takes no notice of the floor; then it learns to."""
+    old = VoxelPoseNet(replace(SMALL.net, floor=False)).eval()
+    save_weights(tmp_path / "old.safetensors", old.state_dict(), old.config, {})
+    words = json.loads(json.dumps(asdict(old.config)))
+    del words["floor"]  # as it was before there was one
+    save_file(old.state_dict(), tmp_path / "older.safetensors", {"format": FORMAT, "net": json.dumps(words)})
+    batch = Batches(SMALL.data, 3, 0, 1)[0]
+    for name in ("old", "older"):
+        trainer = Trainer(replace(SMALL, init=str(tmp_path / f"{name}.safetensors"), steps=1), tmp_path / name)
+        given = (batch.depth, batch.keypoints, batch.root_z)
+        for a, b in zip(trainer.averaged()(*given, batch.floor), old(*given, batch.floor), strict=True):
+            torch.testing.assert_close(a, b)
+        trainer.run()
+        assert (trainer.net.first.weight[:, -3:] != 0).any()
+    with pytest.raises(ModelFileError, match="floor=True.* must be .*floor=False"):
+        Trainer(
+            replace(SMALL, init=str(tmp_path / "old" / "weights.safetensors"), net=replace(SMALL.net, floor=False)),
+            tmp_path / "back",
+        )
+
+
+def test_runs_from_before_the_floor_are_without_it(finished, tmp_path):
+    about = json.loads((finished / "config.json").read_text())
+    assert about["config"]["net"].pop("floor")
+    (tmp_path / "config.json").write_text(json.dumps(about))
+    assert read_config(tmp_path / "config.json").net == replace(SMALL.net, floor=False)
 
 
 def test_a_run_goes_on_without_the_weights_that_it_began_with(finished, tmp_path):

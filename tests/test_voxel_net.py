@@ -1,5 +1,7 @@
 """The default network and its loss: cells and centres, gradients, what may and may not flow, and that it learns."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -28,14 +30,18 @@ def net() -> VoxelPoseNet:
 
 
 def people(b: int, seed: int = 0):
-    """Depth, keypoints, root_z of nobody in particular."""
+    """Depth, keypoints, root_z, floor (of the first one: none) of nobody in particular."""
     g = torch.Generator().manual_seed(seed)
     depth = torch.rand(b, 2, CELLS, CELLS, generator=g) - 0.5
     depth = torch.where(torch.rand(b, 1, CELLS, CELLS, generator=g) < 0.2, EMPTY, depth)
     xy = torch.rand(b, 18, 2, generator=g) * 1.6 - 0.8
     keypoints = torch.cat([xy, torch.rand(b, 18, 1, generator=g)], -1)
     keypoints[:, ::5] = 0
-    return depth, keypoints, 2 + 2 * torch.rand(b, 1, generator=g)
+    root_z = 2 + 2 * torch.rand(b, 1, generator=g)
+    up = torch.nn.functional.normalize(torch.tensor([0.1, -1.0, -0.3]) + 0.1 * torch.randn(b, 3, generator=g), dim=1)
+    floor = torch.cat([up, 1 + torch.rand(b, 1, generator=g)], 1)
+    floor[0] = 0
+    return depth, keypoints, root_z, floor
 
 
 def said(joints, spread=0.05) -> Output:
@@ -82,7 +88,7 @@ def test_the_volume_holds_the_surface_where_the_depth_is(net):
     """One column with one depth: its two neighbouring cells share an occupancy of 1, nowhere else is any."""
     depth = torch.full((1, 2, CELLS, CELLS), EMPTY)
     depth[0, :, 37, 22] = 0.2
-    volume = net._volume(depth, torch.full((1, 1), 3.0), torch.zeros(1, 2, 16, 16, 16))[:, :64]
+    volume = net._volume(depth, torch.full((1, 1), 3.0), torch.zeros(1, 4), torch.zeros(1, 2, 16, 16, 16))[:, :64]
     cells = volume.reshape(1, 4, 4, 4, 16, 16, 16).permute(0, 4, 1, 5, 2, 6, 3).reshape(64, 64, 64)  # z, y, x
     place = cells.nonzero()
     assert set(map(tuple, place[:, 1:].tolist())) == {(37, 22)}
@@ -181,15 +187,45 @@ def test_people_do_not_depend_on_their_company(net):
 
 def test_what_was_not_found_does_not_matter(net):
     """A keypoint of score 0 says nothing by its place."""
-    depth, keypoints, root_z = people(2)
+    depth, keypoints, *rest = people(2)
     moved = torch.where(keypoints[..., 2:] == 0, torch.tensor([0.3, -0.4, 0.0]), keypoints)
     with torch.inference_mode():
-        torch.testing.assert_close(net(depth, moved, root_z), net(depth, keypoints, root_z), atol=1e-6, rtol=1e-6)
+        torch.testing.assert_close(net(depth, moved, *rest), net(depth, keypoints, *rest), atol=1e-6, rtol=1e-6)
+
+
+def test_where_the_floor_is(net):
+    """Heights of the cells and depths of the columns, against points that are told from the plane one by one."""
+    depth, _, root_z, floor = people(4, seed=3)
+    lifted = torch.zeros(4, TINY.lifted, 16, 16, 16)
+    fine, coarse, known = net._volume(depth, root_z, floor, lifted)[:, -3:].unbind(1)
+    assert known[0].abs().max() == 0 == fine[0].abs().max() and (known[1:] == 1).all()
+    rng = np.random.default_rng(0)
+    for person in (1, 2, 3):
+        view = PersonView(np.eye(3), float(root_z[person]))
+        for z, y, x in rng.integers(16, size=(200, 3)):
+            cell = net.coarse[[x, y, z]].numpy()
+            height = float(np.append(view.to_view_frame(cell[None])[0], 1) @ floor[person].numpy())
+            assert fine[person, z, y, x] == pytest.approx(np.clip(height / 0.25, -1, 1), abs=1e-4)
+            assert coarse[person, z, y, x] == pytest.approx(np.clip(height / 1.5, -1, 1), abs=1e-4)
+    away, meets = net._flat_input(depth, torch.zeros(4, 18, 3), root_z, floor)[:, -2:].unbind(1)
+    assert not meets[0].any() and 0 < meets[1:].mean() < 1
+    for person, row, column in meets.nonzero().tolist():
+        xyz = torch.stack([net.fine[column], net.fine[row], away[person, row, column]])
+        on_it = PersonView(np.eye(3), float(root_z[person])).to_view_frame(xyz.numpy()[None])[0]
+        assert np.append(on_it, 1) @ floor[person].numpy() == pytest.approx(0, abs=1e-4)
+
+
+def test_the_floor_may_be_left_out():
+    net = VoxelPoseNet(replace(TINY, floor=False)).eval()
+    depth, keypoints, root_z, floor = people(3)
+    for a, b in zip(net(depth, keypoints, root_z, floor), net(depth, keypoints, root_z, 0 * floor), strict=True):
+        assert torch.equal(a, b)
 
 
 @pytest.mark.parametrize("inside", [True, False])
-def test_sizes(inside):
-    out = VoxelPoseNet(NetConfig((8, 12, 16), 8, 3, inside)).eval()(*people(3))
+@pytest.mark.parametrize("floor", [True, False])
+def test_sizes(inside, floor):
+    out = VoxelPoseNet(NetConfig((8, 12, 16), 8, 3, inside, floor)).eval()(*people(3))
     assert out.joints.shape == out.spread.shape == out.head.shape == (3, 18, 3)
     assert all(torch.isfinite(t).all() for t in out)
 
@@ -204,7 +240,7 @@ def test_learns_eight_people_by_heart():
     optimizer = torch.optim.Adam(net.parameters(), lr=3e-2)
     errors = []
     for _ in range(18):
-        logits, out = net.scores(batch.depth, batch.keypoints, batch.root_z)
+        logits, out = net.scores(batch.depth, batch.keypoints, batch.root_z, batch.floor)
         total, parts = loss(logits, out, batch.joints, batch.root_z, batch.in_view & ~batch.occluded)
         optimizer.zero_grad()
         total.backward()

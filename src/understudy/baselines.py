@@ -19,6 +19,7 @@ from jaxtyping import Bool, Float, Float32
 
 from understudy.assembly import of_network
 from understudy.errors import MissingExtraError, ModelFileError, UnderstudyError
+from understudy.floor import Floor
 from understudy.lifting import NaiveLifter
 from understudy.skeleton import FLIP, JOINTS, N_JOINTS
 from understudy.types import Keypoints2D, Person, RegisteredFrame
@@ -188,6 +189,7 @@ class MlpPredictor(Predictor):
         views: list[PersonView],
         depth: Float32[np.ndarray, "n 2 64 64"],
         keypoints: Float32[np.ndarray, "n 18 3"],
+        floor: Floor | None = None,
     ) -> list[Prediction]:
         if not views:
             return []

@@ -8,7 +8,6 @@ apparent size and by the joints' heights over the floor.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -63,12 +62,12 @@ def find_roots(
     depth: RegisteredDepth,
     camera: Camera,
     min_score: float = 0.2,
-    floor: Callable[[], Floor | None] = lambda: None,
+    floor: Floor | None = None,
 ) -> list[Root]:
     """Where the person may be, the likeliest place first; nearly always one. Empty only without 2D keypoints.
 
-    min_score: keypoints with a lower score are not used, unless there are no others. floor: called only for somebody
-    whom no depth fits; gives the measured floor, if there is one.
+    min_score: keypoints with a lower score are not used, unless there are no others. floor: the measured one; it
+    helps to place somebody whom no depth fits.
     """
     found = person.found & np.isfinite(camera.normalized(person.uv)).all(1)
     usable = found & (person.score >= min_score)
@@ -83,8 +82,8 @@ def find_roots(
     measured = np.concatenate([trunk, [person.torso_z or np.nan], limbs])
     places = _elected(measured, *_unmeasured_depth(ray))
     floor_likelihood = None
-    if any(kind == "size" for *_, kind in places) and (plane := floor()):
-        floor_likelihood = floor_log_likelihood(ray, plane)
+    if any(kind == "size" for *_, kind in places) and floor is not None:
+        floor_likelihood = floor_log_likelihood(ray, floor)
         places = _elected(measured, *_unmeasured_depth(ray, floor_likelihood))
     if not places:  # nothing to measure the keypoints by: any depth is better than none
         values = nearest_depths(depth, camera, uv, k=1, radius=0.1)

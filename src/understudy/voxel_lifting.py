@@ -7,7 +7,6 @@ it believes most wins.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -45,13 +44,10 @@ class VoxelLifter:
             return []
         cloud = voxels.cloud(frame.depth, voxels.ENOUGH)
 
-        @cache
-        def floor() -> Floor | None:
-            return measured_floor(cloud)
-
+        floor = measured_floor(cloud)
         roots = [find_roots(person, frame.depth, frame.camera, self.min_score, floor) for person in people]
         each = [(person, root) for person, several in zip(people, roots, strict=True) for root in several]
-        lifted = iter(self._lift(frame, cloud, each))
+        lifted = iter(self._lift(frame, cloud, floor, each))
         candidates = [[next(lifted) for _ in r] for r in roots]
         chosen = choose(candidates, roots)
         return [
@@ -60,7 +56,11 @@ class VoxelLifter:
         ]
 
     def _lift(
-        self, frame: RegisteredFrame, cloud: Float32[np.ndarray, "n 3"], each: Sequence[tuple[Keypoints2D, Root]]
+        self,
+        frame: RegisteredFrame,
+        cloud: Float32[np.ndarray, "n 3"],
+        floor: Floor | None,
+        each: Sequence[tuple[Keypoints2D, Root]],
     ) -> list[Person]:
         """Every pair of a person and a place. cloud: the frame's points, see `voxels.cloud`."""
         if not each:
@@ -70,7 +70,7 @@ class VoxelLifter:
         rows = np.stack(
             [keypoint_input(v, frame.camera, p, self.min_score) for v, (p, _) in zip(views, each, strict=True)]
         )
-        said = self.predictor(views, depth, rows)
+        said = self.predictor(views, depth, rows, floor)
         return [self._person(*pair, *with_it) for pair, *with_it in zip(each, views, rows, said, strict=True)]
 
     def _person(self, seen: Keypoints2D, root: Root, view: PersonView, rows: Rows, said: Prediction) -> Person:

@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from understudy.camera import Camera
+from understudy.floor import Floor
 from understudy.types import RegisteredDepth
 
 HALF: Final = 1.32
@@ -74,6 +75,15 @@ class PersonView:
         """x and y in view coordinates of image points (colour pixels); NaN where the camera has no ray."""
         ray = np.concatenate([camera.normalized(uv), np.ones((len(uv), 1))], 1)
         return self.from_cam(ray * self.root_z)[:, :2]
+
+    def floor_plane(self, floor: Floor | None) -> Float32[np.ndarray, "4"]:
+        """(a, b, c, d): a point (x, y, z) of the virtual camera's frame is a x + b y + c z + d metres above the floor.
+
+        Zeros without a floor.
+        """
+        if floor is None:
+            return np.zeros(4, np.float32)
+        return np.append(self.R_view_cam @ floor.up, -floor.height).astype(np.float32)
 
     def depth_grid(self, points: Float[np.ndarray, "n 3"]) -> Float32[np.ndarray, "2 64 64"]:
         """Nearest depth of each column, and farthest one within the grid; rows are y, columns x.

@@ -25,7 +25,7 @@ from understudy.synthetic.hand_samples import HandBatch, HandConfig, HandSamples
 
 SHARD: Final = 512
 """hands"""
-VERSION: Final = 5
+VERSION: Final = 6
 """Of what the simulation makes of the same settings."""
 _BATCH = 64
 

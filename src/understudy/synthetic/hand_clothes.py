@@ -24,6 +24,7 @@ _WHOLE = 0.25  # share of pockets that cover all of the hand
 _SHAPELESS = 0.6  # share of pockets in which a hand has no shape of its own: flat cloth is over it
 _OVER = (0.01, 0.05)  # metres: this cloth before the middle of the hand
 _LONG, _WIDE = (0.25, 0.4), (0.14, 0.3)  # metres: its size
+_END_ON = 0.6  # sine between view and fingers, below which the cloth begins to turn towards the camera
 _OF_THE_TOP = 0.3  # share of pockets that are a jacket's
 
 
@@ -85,8 +86,10 @@ def _patch(draw: Draw, edge: Float[Tensor, " b"], to_camera: Float[Tensor, "b 3"
     """Cloth that begins `edge` metres from the wrist and is between the fingers and the camera."""
     b = len(edge)
     lean = 0.2 * draw.normal(b, 3) * torch.tensor([0.5, 1.0, 1.0])
-    normal = to_camera * torch.tensor([0.0, 1.0, 1.0]) + lean
-    normal = F.normalize(normal, dim=1)
+    across = to_camera * torch.tensor([0.0, 1.0, 1.0])
+    end_on = (1 - across.norm(dim=1, keepdim=True) / _END_ON).clamp_min(0)  # seen along the fingers: faces the camera
+    normal = F.normalize(across.lerp(to_camera, end_on) + lean, dim=1)
+    normal = torch.where((normal * to_camera).sum(1, keepdim=True) < 0, -normal, normal)
     fingers = torch.tensor([1.0, 0.0, 0.0]) - normal * normal[:, :1]
     fingers = F.normalize(fingers, dim=1)
     axes = torch.stack([fingers, torch.linalg.cross(normal, fingers), normal], 1)

@@ -49,6 +49,8 @@ class Batch(NamedTuple):
     """x, y (metres), score; (0, 0, 0) where not found"""
     root_z: Float[Tensor, "b 1"]
     """distance of the grid's centre from the camera"""
+    floor: Float[Tensor, "b 4"]
+    """as measured; zeros where it is not known; see `PersonView.floor_plane`"""
     joints: Float[Tensor, "b 18 3"]
     """truth"""
     in_view: Bool[Tensor, "b 18"]
@@ -226,7 +228,8 @@ class Samples:
         )
         hard = (front < _FRONTAL) | before
         tag = torch.stack([rig.kind, people.activity.to(rig.kind.dtype)], -1)
-        return Batch(depth, keypoints, root_z[:, None], columns, in_view, occluded, hard, tag)
+        floor = view.draw_floor(draw, R @ cameras.R_cam_world, cameras.center)
+        return Batch(depth, keypoints, root_z[:, None], floor, columns, in_view, occluded, hard, tag)
 
 
 def hidden_joints(

@@ -11,6 +11,9 @@ from understudy.synthetic.draw import Draw
 from understudy.voxels import CELL, CELLS, EMPTY, HALF, LIMIT
 
 _SIZE_SIGMA = 0.12  # relative error of a distance that is judged by a person's size, see understudy.apparent_size
+_NO_FLOOR = 0.3  # share of people under whom no floor was found
+_FLOOR_TILT, _FLOOR_HEIGHT = 0.006, 0.01  # radians, metres: one sigma of most floors; of a tenth it is four times that
+_NOT_IT, _WRONG = (-0.6, 0.3), 0.03  # metres: errors of a few heights (a table; somebody on a step); their share
 _NEAREST_Z = 0.1  # metres: nothing nearer to the camera is measured
 
 
@@ -70,3 +73,22 @@ def draw_root(
     z_sigma = torch.where(measured[:, TORSO].any(-1), z_sigma, _SIZE_SIGMA * distance)
     root_z = distance - 0.08 + z_sigma * draw.normal(b)
     return center, root_z.clamp_min(0.4)
+
+
+def draw_floor(draw: Draw, R_view_world: Float[Tensor, "b 3 3"], center: Float[Tensor, "b 3"]) -> Float[Tensor, "b 4"]:
+    """The floor as it would be measured: planes as of `PersonView.floor_plane`, zeros where there is none.
+
+    center: the camera in the world, where the floor is z = 0 and the person at the origin; metres.
+    """
+    b = len(center)
+    worse = torch.where(draw.chance(0.1, b), 4.0, 1.0)
+    tilt = _FLOOR_TILT * worse[:, None] * draw.normal(b, 2)
+    up = torch.cat([tilt, torch.ones_like(tilt[:, :1])], 1)
+    up = torch.nn.functional.normalize(up, dim=-1)
+    off = _FLOOR_HEIGHT * worse * draw.normal(b)
+    # what was seen of the floor lies before or behind the person: there, the plane is right but for its height
+    middle = center * torch.stack([draw.uniform(-0.7, 0.7, b), draw.uniform(-0.5, 0.7, b), 0 * off], 1)
+    off = torch.where(draw.chance(_WRONG, b), draw.uniform(*_NOT_IT, b), off)
+    height = ((center - middle) * up).sum(-1) + off
+    plane = torch.cat([(R_view_world @ up[..., None])[..., 0], height[:, None]], 1)
+    return torch.where(draw.chance(_NO_FLOOR, b)[:, None], 0.0, plane)

@@ -32,7 +32,7 @@ def load_net(path: Path) -> VoxelPoseNet:
     if words.get("format") != FORMAT:
         raise ModelFileError(f"{path}: format is {words.get('format')!r}, must be {FORMAT!r}")
     try:
-        sizes = json.loads(words["net"])
+        sizes = {"floor": False, **json.loads(words["net"])}  # before there was one
         net = VoxelPoseNet(NetConfig(**{**sizes, "channels": tuple(sizes["channels"])}))
         net.load_state_dict(tensors)
     except (RuntimeError, KeyError, TypeError, ValueError) as e:

@@ -15,14 +15,16 @@ from understudy.files import write_atomically
 from understudy.voxelposenet.net import VoxelPoseNet
 from understudy.voxels import CELLS
 
-INPUTS, OUTPUTS = ("depth", "keypoints", "root_z"), ("joints", "spread", "head")
+INPUTS, OUTPUTS = ("depth", "keypoints", "root_z", "floor"), ("joints", "spread", "head")
 _LARGE = 256  # numbers: what is stored in half precision
 
 
 def export_onnx(net: VoxelPoseNet, path: Path, half: bool = True) -> None:
     """Writes the network as ONNX, for any number of people at once. half: see `write_onnx`."""
-    example = (torch.rand(2, 2, CELLS, CELLS), torch.rand(2, 18, 3), torch.full((2, 1), 3.0))
-    write_onnx(net, example, INPUTS, OUTPUTS, path, half)
+    floor = torch.tensor([[0.0, -1.0, 0.0, 1.5]]).expand(2, 4)
+    example = (torch.rand(2, 2, CELLS, CELLS), torch.rand(2, 18, 3), torch.full((2, 1), 3.0), floor)
+    inputs = INPUTS if net.config.floor else INPUTS[:-1]
+    write_onnx(net, example, inputs, OUTPUTS, path, half)
 
 
 def write_onnx(

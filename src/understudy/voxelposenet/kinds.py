@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple, Protocol, runtime_checkable
 
@@ -86,7 +87,7 @@ class DefaultKind:
 
     def learn(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
         with torch.autocast(batch.depth.device.type, torch.bfloat16, enabled=self.config.bf16):
-            logits, output = self.net.scores(batch.depth, batch.keypoints, batch.root_z)
+            logits, output = self.net.scores(batch.depth, batch.keypoints, batch.root_z, batch.floor)
         return loss(logits, output, batch.joints, batch.root_z, batch.in_view & ~batch.occluded)
 
     def estimate(self, net: nn.Module, batch: Batch) -> Estimate:
@@ -102,9 +103,10 @@ class DefaultKind:
 
     def load(self, path: Path) -> None:
         given = load_net(path)
-        if given.config != self.config.net:
-            raise ModelFileError(f"{path}: weights of a network of {given.config}, must be {self.config.net}")
-        self.net.load_state_dict(given.state_dict())
+        wanted = self.config.net
+        if given.config not in (wanted, replace(wanted, floor=False)):
+            raise ModelFileError(f"{path}: weights of a network of {given.config}, must be {wanted}")
+        self.net.load_state_dict(_widened(given.state_dict(), self.net.state_dict()))
 
 
 class PaperKind:
@@ -152,6 +154,18 @@ class PaperKind:
         self.net.load_variables(weights, str(path))
 
 
+def _widened(state: Mapping[str, Tensor], like: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Weights of a network without the floor, for one with it: of the inputs that are new, last of all, it takes no
+    notice yet.
+    """
+    out = {}
+    for name, tensor in state.items():
+        wide = torch.zeros_like(like[name])
+        wide[tuple(slice(n) for n in tensor.shape)] = tensor
+        out[name] = wide
+    return out
+
+
 def make(config: TrainConfig, device: torch.device) -> Kind:
     """The network of a configuration, with fresh weights."""
     return DefaultKind(config, device) if config.network == "default" else PaperKind(config, device)
@@ -159,5 +173,5 @@ def make(config: TrainConfig, device: torch.device) -> Kind:
 
 def read_default(net: nn.Module, batch: Batch) -> Estimate:
     """What the default network says of people."""
-    out = net(batch.depth, batch.keypoints, batch.root_z)
+    out = net(batch.depth, batch.keypoints, batch.root_z, batch.floor)
     return Estimate(out.joints, out.head[..., 0].exp(), out.head[..., 1].sigmoid())

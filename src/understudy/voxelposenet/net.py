@@ -4,6 +4,7 @@ Made for a CPU. What the paper does at 64^3 with 64 channels happens here at 16^
 4 x 4 x 4 cells into channels, and everything that is constant along z (the score maps) passes through a 2D trunk whose
 result is added to the 3D features. The last layer unfolds to 32^3 scores per joint; their softmax is the joint's
 distribution.
+Where the floor is known, each cell is also told how high above it it is.
 All inputs and outputs are in the coordinates of `understudy.voxels.PersonView`.
 """
 
@@ -18,12 +19,14 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from understudy.skeleton import N_JOINTS
-from understudy.voxels import CELL, CELLS, EMPTY, HALF
+from understudy.voxels import CELL, CELLS, EMPTY, HALF, LIMIT
 
 FOLD = 4
 COARSE = CELLS // FOLD  # 16: cells along an edge of the 3D features
 _FREE = 0.25  # metres of truncation of the signed distance to the seen surface
 _SIGMA = 0.06  # metres: width of a keypoint's score map
+_HEIGHTS = (0.25, 1.5)  # metres above and below the floor that the network tells apart, finely and coarsely
+_LEAST_SLOPE = 1e-3  # of a ray that goes down to the floor
 
 
 @dataclass(frozen=True)
@@ -38,6 +41,8 @@ class NetConfig:
     """features per z slice that the 2D trunk writes into the volume"""
     inside: bool = True
     """use what lies in front of and behind the seen surface (free, hidden), not only the surface"""
+    floor: bool = True
+    """use the floor, where one is given"""
 
 
 class Output(NamedTuple):
@@ -80,10 +85,12 @@ class VoxelPoseNet(nn.Module):
         self.config = config = config or NetConfig()
         c16, c8, c4 = config.channels
         two, three = (nn.Conv2d, nn.BatchNorm2d), (nn.Conv3d, nn.BatchNorm3d)
-        self.maps = _block(*two, N_JOINTS + 2, config.channels_2d, FOLD, FOLD)
+        flat = N_JOINTS + 2 + (2 if config.floor else 0)
+        self.maps = _block(*two, flat, config.channels_2d, FOLD, FOLD)
         self.trunk_2d = nn.Sequential(*(_Residual(*two, config.channels_2d) for _ in range(2)))
         self.lift = nn.Conv2d(config.channels_2d, c16 + COARSE * config.lifted, 1)
         volume = FOLD**3 + (FOLD**2 if config.inside else 0) + config.lifted + 4
+        volume += len(_HEIGHTS) + 1 if config.floor else 0
         self.first = nn.Conv3d(volume, c16, 1, bias=False)
         self.first_norm = nn.BatchNorm3d(c16)
         self.block16 = _Residual(*three, c16)
@@ -106,18 +113,24 @@ class VoxelPoseNet(nn.Module):
         self.register_buffer("coarse", fine.reshape(COARSE, FOLD).mean(1), persistent=False)
 
     def forward(
-        self, depth: Float[Tensor, "b 2 64 64"], keypoints: Float[Tensor, "b 18 3"], root_z: Float[Tensor, "b 1"]
+        self,
+        depth: Float[Tensor, "b 2 64 64"],
+        keypoints: Float[Tensor, "b 18 3"],
+        root_z: Float[Tensor, "b 1"],
+        floor: Float[Tensor, "b 4"],
     ) -> Output:
         """Inputs as `understudy.voxels.PersonView` makes them. See `Output`."""
-        _, output = self.scores(depth, keypoints, root_z)
+        _, output = self.scores(depth, keypoints, root_z, floor)
         return output
 
-    def scores(self, depth: Tensor, keypoints: Tensor, root_z: Tensor) -> tuple[Float[Tensor, "b 18 8 4096"], Output]:
+    def scores(
+        self, depth: Tensor, keypoints: Tensor, root_z: Tensor, floor: Tensor
+    ) -> tuple[Float[Tensor, "b 18 8 4096"], Output]:
         """Also the logits over the 32^3 cells: 8 sub-cells (z, y, x) of each of the 16^3 (z, y, x)."""
-        flat = self.trunk_2d(self.maps(self._flat_input(depth, keypoints)))
+        flat = self.trunk_2d(self.maps(self._flat_input(depth, keypoints, root_z, floor)))
         b, c16 = depth.shape[0], self.config.channels[0]
         added, lifted = self.lift(flat).split([c16, COARSE * self.config.lifted], 1)
-        x = self.first(self._volume(depth, root_z, lifted.reshape(b, -1, COARSE, COARSE, COARSE)))
+        x = self.first(self._volume(depth, root_z, floor, lifted.reshape(b, -1, COARSE, COARSE, COARSE)))
         x16 = self.block16(F.relu(self.first_norm(x + added[:, :, None])))
         x8 = self.block8(self.down8(x16))
         x4 = self.block4(self.down4(x8))
@@ -127,15 +140,22 @@ class VoxelPoseNet(nn.Module):
         # The judge must not bend what it judges: it sees features and distribution, but sends no gradient into them.
         return logits, self._read(logits, self.features(x16.detach()), keypoints)
 
-    def _flat_input(self, depth: Tensor, keypoints: Tensor) -> Tensor:
-        """Score maps, and the nearest depth with its mask."""
+    def _flat_input(self, depth: Tensor, keypoints: Tensor, root_z: Tensor, floor: Tensor) -> Tensor:
+        """Score maps; the nearest depth, and the floor's, each with its mask."""
         near = depth[:, :1]
         seen = (near < 0.5 * (EMPTY + HALF)).to(near.dtype)
         dx = torch.exp(-(((self.fine - keypoints[..., :1]) / _SIGMA) ** 2) / 2) * keypoints[..., 2:]
         dy = torch.exp(-(((self.fine - keypoints[..., 1:2]) / _SIGMA) ** 2) / 2)
-        return torch.cat([dy[..., :, None] * dx[..., None, :], near * seen, seen], 1)
+        parts = [dy[..., :, None] * dx[..., None, :], near * seen, seen]
+        if self.config.floor:
+            nx, ny, nz, d = floor[:, :, None, None].unbind(1)
+            slope = (nx * self.fine + ny * self.fine[:, None]) / root_z[..., None] + nz
+            z = d / (-slope).clamp_min(_LEAST_SLOPE) - root_z[..., None]
+            meets = ((z.abs() < LIMIT) & (slope < -_LEAST_SLOPE)).to(near.dtype)
+            parts += [(z * meets)[:, None], meets[:, None]]
+        return torch.cat(parts, 1)
 
-    def _volume(self, depth: Tensor, root_z: Tensor, lifted: Tensor) -> Tensor:
+    def _volume(self, depth: Tensor, root_z: Tensor, floor: Tensor, lifted: Tensor) -> Tensor:
         """3D features at 16^3, axes (z, y, x)."""
         b = depth.shape[0]
         near = depth[:, :1]
@@ -157,6 +177,13 @@ class VoxelPoseNet(nn.Module):
             c[None, None, None, None, :].expand(shape),
             scale[:, None, :, None, None].expand(shape),
         ]
+        if self.config.floor:
+            nx, ny, nz, d = floor[:, :, None, None, None].unbind(1)
+            distance = root_z[..., None, None]
+            slope = (nx * c + ny * c[:, None]) / distance + nz
+            height = (slope * (c[:, None, None] + distance) + d)[:, None]
+            known = (floor != 0).any(1).to(lifted.dtype)[:, None, None, None, None].expand(shape)
+            parts += [*((height / h).clamp(-1, 1) * known for h in _HEIGHTS), known]
         return torch.cat([p.to(lifted.dtype) for p in parts], 1)
 
     def _read(self, logits: Tensor, features: Tensor, keypoints: Tensor) -> Output:

@@ -12,6 +12,7 @@ from scipy.special import expit
 
 from understudy import runtime
 from understudy.camera import Camera
+from understudy.floor import Floor
 from understudy.types import Keypoints2D
 from understudy.voxels import PersonView
 
@@ -50,12 +51,16 @@ class Predictor:
         views: list[PersonView],
         depth: Float32[np.ndarray, "n 2 64 64"],
         keypoints: Float32[np.ndarray, "n 18 3"],
+        floor: Floor | None = None,
     ) -> list[Prediction]:
-        """depth, keypoints: of each view, as `PersonView.depth_grid` and `keypoint_input` make them."""
+        """depth, keypoints: of each view, as `PersonView.depth_grid` and `keypoint_input` make them. floor: of all."""
         if not views:
             return []
         root_z = np.array([[v.root_z] for v in views], np.float32)
-        joints, spread, head = self.network(depth=depth, keypoints=keypoints, root_z=root_z)
+        given = {"depth": depth, "keypoints": keypoints, "root_z": root_z}
+        if "floor" in self.network.inputs:
+            given["floor"] = np.stack([v.floor_plane(floor) for v in views])
+        joints, spread, head = self.network(**given)
         return [
             Prediction(
                 j.astype(np.float64),

@@ -262,8 +262,14 @@ def read_config(path: Path, base: TrainConfig | None = None) -> TrainConfig:
     base: has what the file does not say. Raises UnderstudyError that names the file and the field.
     """
     data = read_json(path)
-    inner = {"optimizer": "adamw", **data["config"]} if isinstance(data.get("config"), dict) else data  # before Muon
+    inner = _completed(data["config"]) if isinstance(data.get("config"), dict) else data
     return from_json(inner, base or TrainConfig(), str(path))
+
+
+def _completed(config: Mapping[str, Any]) -> dict[str, Any]:
+    """The configuration of a run with what runs did before it could be said."""
+    net = config.get("net")
+    return {"optimizer": "adamw", **config} | ({"net": {"floor": False, **net}} if isinstance(net, dict) else {})
 
 
 def _worker(number: int) -> None:
