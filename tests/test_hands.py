@@ -386,6 +386,46 @@ def test_unsure_wrists_are_looked_at_again_where_they_were_found(sigma: float, s
     np.testing.assert_allclose(hands.left.normal, pooled_normal, atol=1e-9)
 
 
+@pytest.mark.parametrize(
+    ("left", "right", "wrists", "asked"),
+    [
+        (0.9, 0.8, ("observed", "observed"), []),  # the network is sure of both
+        (0.9, 0.5, ("observed", "observed"), [["right"]]),
+        (0.4, 0.5, ("observed", "observed"), [["left", "right"]]),
+        (0.4, 0.5, ("observed", "inferred"), [["left"]]),  # the right hand is hidden
+    ],
+)
+def test_colour_networks_are_asked_where_the_first_look_is_unsure(
+    left: float, right: float, wrists: tuple[str, str], asked: list[list[str]]
+) -> None:
+    words: list[np.ndarray] = []
+    sought: list[list[str]] = []
+
+    def says(views: list[HandView], depth: object, color: np.ndarray, image: object) -> list[HandPrediction]:
+        words.append(color[:, -1])
+        return [_word([0, 0, 1], sure) for sure in ((left, right) if len(words) == 1 else [0.9] * len(views))]
+
+    class Palms:
+        def estimate(self, frame: object, person: Person, sides: list[str]) -> dict[str, ColorPalm]:
+            sought.append(list(sides))
+            x, z, nothing = np.array([1.0, 0, 0]), np.array([0, 0, 1.0]), np.zeros((21, 3))
+            return {side: ColorPalm(z, x, 0.1, 0.9, nothing, nothing, 1.0, 0.8, 40.0) for side in sides}
+
+    estimator = HandNormalEstimator(color=False)
+    estimator.predictor, estimator.color_path = says, Palms()  # type: ignore[assignment]
+    joints = skeleton(7) - [0.2, 0, 0]
+    joints[[JOINT["left_wrist"], JOINT["right_wrist"]]] = [[0.1, 0.05, 2.4], [-0.1, 0.05, 2.4]]
+    source = ["observed"] * N_JOINTS
+    source[JOINT["left_wrist"]], source[JOINT["right_wrist"]] = wrists
+    hands = estimator.estimate(frame_of(), replace(person(joints), source=tuple(source)))
+    assert sought == asked and not words[0].any()
+    assert len(words) == 1 + len(asked) and all(w.tolist() == [1.0] * len(asked[0]) for w in words[1:])
+    for side, first in (("left", left), ("right", right)):
+        again = any(side in sides for sides in asked)
+        palm = hands[side]
+        assert palm is not None and (palm.confidence > first + 0.05) == again
+
+
 # -- what it reaches -----------------------------------------------------------------------------------------------
 
 

@@ -170,8 +170,8 @@ class ColorPath:
         self, frame: RegisteredFrame, person: Person, sides: Sequence[str] = SIDES
     ) -> dict[str, ColorPalm | None]:
         """'left', 'right' -> palm; None where no hand was found at the wrist, or none was looked for (`sides`)."""
-        places = {side: hand_place(frame.camera, person, side) for side in sides}
-        regions = self._regions(frame, {side: place for side, place in places.items() if place is not None})
+        places = {side: hand_place(frame.camera, person, side) for side in SIDES}
+        regions = self._regions(frame, {side: place for side, place in places.items() if place is not None}, sides)
         jitter = {side: jittered(region, self.crops) for side, region in regions.items()}
         looks = self._looks(frame, [region for side in jitter for region in jitter[side]])
         out: dict[str, ColorPalm | None] = dict.fromkeys(SIDES)
@@ -181,15 +181,16 @@ class ColorPath:
             out[side] = self._combine(frame.camera, place, side, looks[i * self.crops : (i + 1) * self.crops])
         return out
 
-    def _regions(self, frame: RegisteredFrame, places: dict[str, HandPlace]) -> dict[str, Region]:
-        """The region of each hand for which a palm was found: the best palm that is nearer to its wrist than to the
-        other, and near enough.
+    def _regions(self, frame: RegisteredFrame, places: dict[str, HandPlace], sides: Sequence[str]) -> dict[str, Region]:
+        """The region of each hand of `sides` for which a palm was found: the best palm that is nearer to its wrist than
+        to the other, and near enough.
         """
-        windows = [place.window for place in places.values()]
+        sought = {side: place for side, place in places.items() if side in sides}
+        windows = [place.window for place in sought.values()]
         found = self._nets.palms([window.crop(frame.color, PALM_SIZE) for window in windows])
         wrists = {side: np.array(place.wrist) for side, place in places.items()}
         out = {}
-        for (side, place), palms in zip(places.items(), found, strict=True):
+        for (side, place), palms in zip(sought.items(), found, strict=True):
             A = place.window.to_image(PALM_SIZE)
             for palm in palms:
                 wrist = A[:, :2] @ palm[PALM_WRIST] + A[:, 2]

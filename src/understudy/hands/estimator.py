@@ -31,7 +31,8 @@ LEAST_CONFIDENCE: Final = 0.2
 _WRIST_SIGMA = ([0.15, 0.4, 0.6, 0.8, 0.94, 0.99], [0.10, 0.085, 0.070, 0.052, 0.042, 0.030])
 """confidence of a palm -> radius (metres) that holds 68 % of the wrist's errors: 1.3 times that of simulated hands"""
 _BALL = 1.87  # radius that holds 68 % of a normal distribution in space, in sigmas along an axis
-_SURE, _CONFIDENT = 0.03 * _BALL, 0.6  # metres, sigma of a wrist below which one look is enough; confidence above which
+_CONFIDENT = 0.7  # of a palm, above which one look is enough
+_SURE = 0.03 * _BALL  # metres: sigma of a wrist below which it is looked at again in the same place
 _AGREE = np.radians(35)  # the colour path's joints are used where its normal is so near to the result
 _NEIGHBOURS = np.arange(3)  # cells around a keypoint's, in a crop with a rim
 _BEFORE, _BEHIND = 0.03, 0.05  # metres: a keypoint is supported by a surface from so far before to so far behind it
@@ -43,11 +44,11 @@ class HandNormalEstimator:
 
     1. `HandView`: where the body says that a hand is, how large and how turned; left or right is the body's word.
     2. `HandView.depth_crop`, `color_crop`: depth and colour around the hand.
-    3. `ColorPath`: where the wrist is seen, palm detection and hand landmarks on larger crops of the colour image
-       (optional).
-    4. `HandPredictor`: a network that is told all this, and the body's joints, trained to weigh it; where the fingers
+    3. `HandPredictor`: a network that is told all this, and the body's joints, trained to weigh it; where the fingers
        cannot be seen, what the forearm and the posture make likely is left.
-    5. A second look where the network found the wrist, if neither skeleton nor network is sure; `pooled` joins both.
+    4. A hand of which it is not sure is looked at again, and `pooled` joins both looks. If the wrist is seen, the
+       network is now told what the `ColorPath` says: palm detection and hand landmarks on larger crops of the colour
+       image (optional). If the skeleton's wrist may be elsewhere, the view is now around the one that was found.
     """
 
     def __init__(
@@ -81,14 +82,9 @@ class HandNormalEstimator:
         """The hands of several people of one frame."""
         registered = frame if isinstance(frame, RegisteredFrame) else register(frame)
         places = [self._views(registered.camera, person) for person in people]
-        seen = [self._color_palms(registered, person, views) for person, (views, _) in zip(people, places, strict=True)]
-        hands = [
-            _Hand(i, side, people[i], view, seen[i].get(side))
-            for i, (views, _) in enumerate(places)
-            for side, view in views.items()
-        ]
+        hands = [_Hand(i, side, people[i], view) for i, (views, _) in enumerate(places) for side, view in views.items()]
         looks = self._looks(registered, hands)
-        words = self._with_second_looks(registered, hands, [word for _, word in looks])
+        hands, words = self._with_second_looks(registered, hands, [word for _, word in looks])
         palms: list[dict[str, Palm]] = [{} for _ in people]
         wrists: list[dict[str, Wrist]] = [{} for _ in people]
         for hand, word, (crop, _) in zip(hands, words, looks, strict=True):
@@ -101,14 +97,6 @@ class HandNormalEstimator:
         return [
             Hands(p.get("left"), p.get("right"), why, w) for p, w, (_, why) in zip(palms, wrists, places, strict=True)
         ]
-
-    def _color_palms(
-        self, frame: RegisteredFrame, person: Person, views: dict[str, HandView]
-    ) -> dict[str, ColorPalm | None]:
-        if self.color_path is None or not views:
-            return {}
-        seen = [side for side in views if person.source[JOINT[f"{side}_wrist"]] == OBSERVED]
-        return self.color_path.estimate(frame, person, seen)
 
     def _looks(self, frame: RegisteredFrame, hands: Sequence[_Hand]) -> list[tuple[DepthCrop, HandPrediction]]:
         """Of each hand, its depth crop and what the network says."""
@@ -125,14 +113,31 @@ class HandNormalEstimator:
 
     def _with_second_looks(
         self, frame: RegisteredFrame, hands: Sequence[_Hand], words: Sequence[HandPrediction]
-    ) -> list[HandPrediction]:
-        """What neither skeleton nor network is sure of is looked at again, where the network found the wrist."""
-        out = list(words)
-        doubtful = [k for k, hand in enumerate(hands) if hand.unsure and out[k].confidence < _CONFIDENT]
-        again = [(k, moved) for k in doubtful if (moved := hands[k].at(out[k])) is not None]
+    ) -> tuple[list[_Hand], list[HandPrediction]]:
+        """The hands and what is said of them, after those of which the network was not sure were looked at again."""
+        hands, out = list(hands), list(words)
+        doubtful = [k for k, word in enumerate(words) if word.confidence < _CONFIDENT]
+        for k, palm in zip(doubtful, self._color_palms(frame, [hands[k] for k in doubtful]), strict=True):
+            hands[k] = replace(hands[k], color=palm)
+        again = [(k, hand) for k in doubtful if (hand := hands[k].again(words[k])) is not None]
         for (k, _), (_, word) in zip(again, self._looks(frame, [hand for _, hand in again]), strict=True):
             out[k] = pooled([out[k], word])
-        return out
+        return hands, out
+
+    def _color_palms(self, frame: RegisteredFrame, hands: Sequence[_Hand]) -> list[ColorPalm | None]:
+        """What the colour path says of hands whose wrists are seen; both hands of a person at once."""
+        path = self.color_path
+        if path is None:
+            return [None] * len(hands)
+        sought: dict[int, list[_Hand]] = {}
+        for hand in hands:
+            if hand.seen:
+                sought.setdefault(hand.number, []).append(hand)
+        found = {
+            number: path.estimate(frame, of_one[0].person, [hand.side for hand in of_one])
+            for number, of_one in sought.items()
+        }
+        return [found.get(hand.number, {}).get(hand.side) for hand in hands]
 
     def _views(self, camera: Camera, person: Person) -> tuple[dict[str, HandView], dict[str, str]]:
         """The view of each hand, or why there is none."""
@@ -174,15 +179,24 @@ class _Hand:
     side: str
     person: Person
     view: HandView
-    color: ColorPalm | None
-    """what the colour path says, where it found the palm"""
+    color: ColorPalm | None = None
+    """what the colour path says, where it was asked and found the palm"""
+
+    @property
+    def seen(self) -> bool:
+        return self.person.source[JOINT[f"{self.side}_wrist"]] == OBSERVED
 
     @property
     def unsure(self) -> bool:
         """Whether the skeleton's wrist may be elsewhere."""
         return not self.person.sigma_m[JOINT[f"{self.side}_wrist"]] < _SURE  # NaN counts
 
-    def at(self, word: HandPrediction) -> _Hand | None:
+    def again(self, word: HandPrediction) -> _Hand | None:
+        """What to look at after `word`; None where a second look would be the same as the first."""
+        moved = self._at(word) if self.unsure else None
+        return moved or (None if self.color is None else self)
+
+    def _at(self, word: HandPrediction) -> _Hand | None:
         """The same hand with its wrist where the network found it; None where it cannot be there."""
         joints = self.person.keypoints.copy()
         joints[JOINT[f"{self.side}_wrist"]] = word.landmarks[0]
