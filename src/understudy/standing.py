@@ -17,7 +17,7 @@ from understudy.skeleton import JOINTS, TORSO
 
 HEIGHT_SIGMA: Final = 0.07
 """metres: one sigma of a joint's height about that of the most alike of the known people"""
-NETWORK_SIGMA: Final = 0.10
+NETWORK_SIGMA: Final = 0.06
 """of the log of the distance at which the network puts somebody whom the depth camera did not measure"""
 
 _PARTS = ("nose", "neck", "shoulder", "hip", "knee", "ankle")
