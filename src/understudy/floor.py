@@ -21,6 +21,7 @@ MAX_BELOW = 0.03
 """share of the points, under the floor: else it is a table"""
 
 _SAMPLES, _TRIES = 4000, 600
+_FEW, _BEST = 600, 40  # points that judge all planes; planes that all points judge
 _LOW = 0.35  # share of the points that are lowest in the camera's frame
 
 
@@ -74,16 +75,29 @@ def measured_floor(points: Float32[np.ndarray, "n 3"]) -> Floor | None:
     upright = np.abs(normals @ CAMERA_UP) > np.cos(MAX_TILT) * np.maximum(length, 1e-9)
     normals = normals[upright] / length[upright, None]
     normals *= np.sign(normals @ CAMERA_UP)[:, None]
-    over = points @ normals.T - np.sum(a[upright] * normals, axis=1)  # points x planes, metres
-    on = (np.abs(over) < THICKNESS_M).mean(axis=0)
-    on[(over < -4 * THICKNESS_M).mean(axis=0) > MAX_BELOW] = 0
+    heights = np.sum(a[upright] * normals, axis=1)
+    few = np.argsort(-_floor_share(points[:_FEW], normals, heights))[:_BEST]  # all points judge only the best planes
+    normals, heights = normals[few], heights[few]
+    on = _floor_share(points, normals, heights)
     if not len(on) or on.max() < MIN_SHARE:
         return None
-    best = points[np.abs(over[:, np.argmax(on)]) < THICKNESS_M]
+    k = np.argmax(on)
+    best = points[np.abs(points @ normals[k] - heights[k]) < THICKNESS_M]
     centre = best.mean(axis=0)
     up = np.linalg.svd(best - centre, full_matrices=False)[2][2]
     up *= np.sign(up @ CAMERA_UP) or 1.0
     return Floor(up, float(up @ centre))
+
+
+def _floor_share(
+    points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "k 3"], heights: Float[np.ndarray, " k"]
+) -> Float[np.ndarray, " k"]:
+    """Share of the points on each plane; 0 for planes that too many are under."""
+    over = normals @ points.T - heights[:, None]  # planes x points, metres
+    on = (np.abs(over) < THICKNESS_M).mean(axis=1)
+    below = (over < -4 * THICKNESS_M).mean(axis=1)
+    share: np.ndarray = np.where(below > MAX_BELOW, 0.0, on)
+    return share
 
 
 def world_from_camera(floor: Floor) -> Float[np.ndarray, "4 4"]:

@@ -60,9 +60,9 @@ def floor_log_likelihood(ray: Float[np.ndarray, "18 2"], floor: Floor) -> Float[
 def stood(joints: Float[np.ndarray, "18 3"], floor_likelihood: Float[np.ndarray, "140"]) -> Float[np.ndarray, "18 3"]:
     """A person (metres, colour camera's frame) as far away as both the floor and the network say.
 
-    floor_likelihood: `floor_log_likelihood`. The network, which knows the floor only through the root, goes by how
-    large people are; to its distance, `NETWORK_SIGMA` is one sigma. All joints move along their rays: the person grows
-    or shrinks.
+    floor_likelihood: `floor_log_likelihood`. The network goes by how large people are, and is told the floor, too, but
+    finds its distance less well than the heights of all joints do; to its distance, `NETWORK_SIGMA` is one sigma. All
+    joints move along their rays: the person grows or shrinks.
     """
     trunk = float(np.linalg.norm(joints[TORSO].mean(0)))
     distance, _ = distance_of(floor_likelihood - 0.5 * ((LOG_DISTANCES - np.log(trunk)) / NETWORK_SIGMA) ** 2)
