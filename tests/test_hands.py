@@ -356,7 +356,9 @@ def test_within_10_cm_is_the_share_of_normal_errors() -> None:
     assert 0.95 < sure.confidence <= 1 and unsure.confidence == within_10_cm(unsure.sigma_m)
 
 
-@pytest.mark.parametrize(("sigma", "sure", "looks"), [(0.02, 0.5, 1), (0.15, 0.5, 2), (np.nan, 0.5, 2), (0.15, 0.7, 1)])
+@pytest.mark.parametrize(
+    ("sigma", "sure", "looks"), [(0.02, 0.5, 1), (0.15, 0.5, 2), (np.nan, 0.5, 2), (0.15, 0.95, 1)]
+)
 def test_unsure_wrists_are_looked_at_again_where_they_were_found(sigma: float, sure: float, looks: int) -> None:
     joints = skeleton(7) - [0.2, 0, 0]
     row = JOINT["left_wrist"]
@@ -389,8 +391,8 @@ def test_unsure_wrists_are_looked_at_again_where_they_were_found(sigma: float, s
 @pytest.mark.parametrize(
     ("left", "right", "wrists", "asked"),
     [
-        (0.9, 0.8, ("observed", "observed"), []),  # the network is sure of both
-        (0.9, 0.5, ("observed", "observed"), [["right"]]),
+        (0.98, 0.96, ("observed", "observed"), []),  # the network is sure of both
+        (0.98, 0.5, ("observed", "observed"), [["right"]]),
         (0.4, 0.5, ("observed", "observed"), [["left", "right"]]),
         (0.4, 0.5, ("observed", "inferred"), [["left"]]),  # the right hand is hidden
     ],
@@ -403,7 +405,7 @@ def test_colour_networks_are_asked_where_the_first_look_is_unsure(
 
     def says(views: list[HandView], depth: object, color: np.ndarray, image: object) -> list[HandPrediction]:
         words.append(color[:, -1])
-        return [_word([0, 0, 1], sure) for sure in ((left, right) if len(words) == 1 else [0.9] * len(views))]
+        return [_word([0, 0, 1], sure) for sure in ((left, right) if len(words) == 1 else [0.99] * len(views))]
 
     class Palms:
         def estimate(self, frame: object, person: Person, sides: list[str]) -> dict[str, ColorPalm]:

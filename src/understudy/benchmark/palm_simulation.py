@@ -8,13 +8,14 @@ from itertools import count
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Bool, Float, Float32, UInt8
 from scipy.special import expit
 
 from understudy.errors import MissingExtraError, UnderstudyError
 from understudy.hands.crop import EMPTY, GREY
-from understudy.hands.estimator import LEAST_CONFIDENCE
+from understudy.hands.estimator import CONFIDENT, LEAST_CONFIDENCE
 from understudy.hands.nets import WRIST
+from understudy.hands.predictor import HandPrediction, pooled
 
 if TYPE_CHECKING:
     import torch
@@ -115,8 +116,10 @@ def from_simulation(simulated: SimulatedHands, network: HandNetwork) -> Source:
     blind = np.zeros_like(simulated.depth)
     blind[:, 0] = EMPTY
     mute, grey = np.zeros_like(simulated.color), np.full_like(simulated.image, GREY)
-    every = _ask(network, simulated, simulated.depth, simulated.color, simulated.image)
     word, given = simulated.color.astype(np.float64), simulated.color[:, 8] > 0
+    first = _ask(network, simulated, simulated.depth, mute, simulated.image)
+    again = given & (first.confidence < CONFIDENT)
+    every = _joined(first, _ask(network, simulated, simulated.depth, simulated.color, simulated.image), again)
     said = {
         BOTH: least_sure(every),
         ALL_GIVEN: every,
@@ -127,10 +130,23 @@ def from_simulation(simulated: SimulatedHands, network: HandNetwork) -> Source:
     about = (
         f"{n} hands in view of simulated people, hands and scenes that neither training nor validation has seen "
         f"({BODIES} bodies, {HANDS} different hands), as they are put to the exported network: depth crops with a "
-        "sensor's errors, colour crops, joints with an estimate's errors, and words of the colour path with its "
-        "measured errors."
+        "sensor's errors, colour crops, joints with an estimate's errors, and, where the first look is unsure, words of "
+        "the colour path with its measured errors."
     )
     return Source("Simulated hands in detail", "simulated", (), True, simulated.hands, said, about, {})
+
+
+def _joined(first: Said, second: Said, again: Bool[np.ndarray, " n"]) -> Said:
+    """What the estimator makes of two looks at some of the hands."""
+    normal, confidence = first.normal.copy(), first.confidence.copy()
+    for i in np.flatnonzero(again):
+        looks = [
+            HandPrediction(said.normal[i], said.normal[i], np.zeros((21, 3)), np.ones(2), float(said.confidence[i]))
+            for said in (first, second)
+        ]
+        both = pooled(looks)
+        normal[i], confidence[i] = both.normal, both.confidence
+    return Said(normal, confidence)
 
 
 def _ask(

@@ -28,10 +28,12 @@ DepthCrop = Float32[np.ndarray, "2 48 48"]
 LEAST_CONFIDENCE: Final = 0.2
 """Palms below are left out."""
 
+CONFIDENT: Final = 0.95
+"""Of a palm, from which on one look is enough."""
+
 _WRIST_SIGMA = ([0.15, 0.4, 0.6, 0.8, 0.94, 0.99], [0.10, 0.085, 0.070, 0.052, 0.042, 0.030])
 """confidence of a palm -> radius (metres) that holds 68 % of the wrist's errors: 1.3 times that of simulated hands"""
 _BALL = 1.87  # radius that holds 68 % of a normal distribution in space, in sigmas along an axis
-_CONFIDENT = 0.7  # of a palm, above which one look is enough
 _SURE = 0.03 * _BALL  # metres: sigma of a wrist below which it is looked at again in the same place
 _AGREE = np.radians(35)  # the colour path's joints are used where its normal is so near to the result
 _NEIGHBOURS = np.arange(3)  # cells around a keypoint's, in a crop with a rim
@@ -116,7 +118,7 @@ class HandNormalEstimator:
     ) -> tuple[list[_Hand], list[HandPrediction]]:
         """The hands and what is said of them, after those of which the network was not sure were looked at again."""
         hands, out = list(hands), list(words)
-        doubtful = [k for k, word in enumerate(words) if word.confidence < _CONFIDENT]
+        doubtful = [k for k, word in enumerate(words) if word.confidence < CONFIDENT]
         for k, palm in zip(doubtful, self._color_palms(frame, [hands[k] for k in doubtful]), strict=True):
             hands[k] = replace(hands[k], color=palm)
         again = [(k, hand) for k in doubtful if (hand := hands[k].again(words[k])) is not None]
