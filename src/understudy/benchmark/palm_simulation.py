@@ -130,8 +130,8 @@ def from_simulation(simulated: SimulatedHands, network: HandNetwork) -> Source:
     about = (
         f"{n} hands in view of simulated people, hands and scenes that neither training nor validation has seen "
         f"({BODIES} bodies, {HANDS} different hands), as they are put to the exported network: depth crops with a "
-        "sensor's errors, colour crops, joints with an estimate's errors, and, where the first look is unsure, words of "
-        "the colour path with its measured errors."
+        "sensor's errors, colour crops, joints with an estimate's errors, and, where the first look is unsure, words "
+        "of the colour path with its measured errors."
     )
     return Source("Simulated hands in detail", "simulated", (), True, simulated.hands, said, about, {})
 
