@@ -36,7 +36,7 @@ def test_confidence_of_a_boaster_becomes_honest():
 def test_the_correction_is_folded_into_the_network():
     torch.manual_seed(0)
     net = VoxelPoseNet(NetConfig(channels=(8, 8, 8), channels_2d=8, lifted=2)).eval()
-    given = torch.rand(2, 2, 64, 64) - 0.5, torch.rand(2, 18, 3) - 0.3, torch.full((2, 1), 3.0)
+    given = torch.rand(2, 2, 64, 64) - 0.5, torch.rand(2, 18, 3) - 0.3, torch.full((2, 1), 3.0), torch.zeros(2, 4)
     with torch.inference_mode():
         before = net(*given)
         apply(net, Correction((0.3, 0.8), (-0.5, 1.7)))

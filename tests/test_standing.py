@@ -11,7 +11,7 @@ from understudy.apparent_size import LOG_DISTANCES, distance_of, size_log_likeli
 from understudy.floor import Floor
 from understudy.roots import find_roots
 from understudy.skeleton import JOINT, JOINTS, N_JOINTS, TORSO
-from understudy.standing import floor_log_likelihood, stood
+from understudy.standing import NETWORK_SIGMA, floor_log_likelihood, stood
 from understudy.types import Keypoints2D, RegisteredDepth, RegisteredFrame
 from understudy.voxel_lifting import VoxelLifter
 
@@ -109,7 +109,7 @@ def test_between_the_network_and_the_floor(floor_sigma: float):
     trunk = np.linalg.norm(joints[TORSO].mean(0))
     says = np.log(trunk) + 0.15
     out = stood(joints, -0.5 * ((LOG_DISTANCES - says) / floor_sigma) ** 2)
-    share = 1 / floor_sigma**2 / (1 / floor_sigma**2 + 1 / 0.10**2)
+    share = 1 / floor_sigma**2 / (1 / floor_sigma**2 + 1 / NETWORK_SIGMA**2)
     assert np.allclose(out, joints * np.exp(0.15 * share), rtol=2e-3)
 
 
