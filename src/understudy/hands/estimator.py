@@ -186,6 +186,7 @@ class _Hand:
 
     @property
     def seen(self) -> bool:
+        """Whether the camera sees the skeleton's wrist."""
         return self.person.source[JOINT[f"{self.side}_wrist"]] == OBSERVED
 
     @property

@@ -87,7 +87,7 @@ def draw_floor(draw: Draw, R_view_world: Float[Tensor, "b 3 3"], center: Float[T
     up = torch.nn.functional.normalize(up, dim=-1)
     off = _FLOOR_HEIGHT * worse * draw.normal(b)
     # what was seen of the floor lies before or behind the person: there, the plane is right but for its height
-    middle = center * torch.stack([draw.uniform(-0.7, 0.7, b), draw.uniform(-0.5, 0.7, b), 0 * off], 1)
+    middle = center * torch.stack([draw.uniform(-0.7, 0.7, b), draw.uniform(-0.5, 0.7, b), torch.zeros_like(off)], 1)
     off = torch.where(draw.chance(_WRONG, b), draw.uniform(*_NOT_IT, b), off)
     height = ((center - middle) * up).sum(-1) + off
     plane = torch.cat([(R_view_world @ up[..., None])[..., 0], height[:, None]], 1)
