@@ -117,7 +117,8 @@ def default_run() -> Callable[[], object]:
     depth = rng.uniform(-1.2, 1.2, (1, 2, 64, 64)).astype(np.float32)
     keypoints = rng.uniform(-0.8, 0.8, (1, 18, 3)).astype(np.float32)
     distance = np.full((1, 1), 2.5, np.float32)
-    return lambda: network(depth=depth, keypoints=keypoints, root_z=distance)
+    floor = np.array([[0.0, -1.0, 0.0, 1.4]], np.float32)
+    return lambda: network(depth=depth, keypoints=keypoints, root_z=distance, floor=floor)
 
 
 def in_turn(runs: dict[tuple[str, str], Callable[[], object]]) -> dict[tuple[str, str], list[float]]:
