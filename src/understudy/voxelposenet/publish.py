@@ -126,8 +126,7 @@ view.
 Trained on simulation only: adults of 15 to 80 years, 1 to 6 m from the camera, upright cameras between 0.4 and 2.4 m
 above the floor. Not for children, animals, wheelchairs, or cameras that look straight down. Where no depth
 is near the person, the distance comes from the apparent size and, if it is seen, the floor, and is off by 6 to 13 %,
-sometimes by half. Wrists and ankles
-are the least sure; hidden ones are guesses, and their sigma says so.
+sometimes by half. Wrists and ankles are the least sure; hidden ones are guesses, and their sigma says so.
 
 ## Configuration
 
