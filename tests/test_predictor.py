@@ -99,8 +99,9 @@ def test_predictor_reads_the_networks_numbers(net, exported):
     assert all((a.joints != b.joints).any() for a, b in zip(said, without, strict=True))
 
 
-def test_networks_without_a_floor_can_still_be_used(tmp_path):
-    old = VoxelPoseNet(replace(TINY, floor=False)).eval()
+@pytest.mark.parametrize("refinement", [0, 2])
+def test_networks_without_a_floor_can_still_be_used(tmp_path, refinement):
+    old = VoxelPoseNet(replace(TINY, floor=False, refinement=refinement)).eval()
     export_onnx(old, tmp_path / "old.onnx", half=False)
     given = inputs(1)
     view = PersonView.towards(np.array([0.0, 0.0, 2.5]))
@@ -207,13 +208,15 @@ def test_other_files_are_refused(net, tmp_path):
 
     about = {
         "format": "understudy-voxelposenet/1",
-        "net": '{"channels": [8, 8, 8], "channels_2d": 8, "lifted": 2, "floor": true}',
+        "net": '{"channels": [8, 8, 8], "channels_2d": 8, "lifted": 2, "floor": true, "refinement": 3}',
     }
     refused("not a readable safetensors file")  # absent
     refused("format is None", good)
     refused("format is 'understudy.paper_net/1'", good, {"format": "understudy.paper_net/1", "variant": "paper"})
     refused(
-        "do not fit", good, {**about, "net": '{"channels": [8, 8, 16], "channels_2d": 8, "lifted": 2, "floor": true}'}
+        "do not fit",
+        good,
+        {**about, "net": '{"channels": [8, 8, 16], "channels_2d": 8, "lifted": 2, "floor": true, "refinement": 3}'},
     )
     refused("do not fit", good, {**about, "net": '{"wings": 2}'})
     refused("do not fit", good, {**about, "net": "["})

@@ -136,12 +136,14 @@ def test_a_run_begins_with_given_weights(finished, tmp_path):
         Trainer(other, tmp_path / "other")
 
 
-def test_a_network_without_the_floor_is_where_one_with_it_begins(tmp_path):
-    """At first it takes no notice of the floor; then it learns to."""
-    old = VoxelPoseNet(replace(SMALL.net, floor=False)).eval()
+@pytest.mark.parametrize("fewer", [{"floor": False, "refinement": 0}, {"refinement": 0}])
+def test_a_smaller_network_is_where_a_larger_one_begins(tmp_path, fewer):
+    """At first it takes no notice of the floor and refines nothing; then it learns to."""
+    old = VoxelPoseNet(replace(SMALL.net, **fewer)).eval()
     save_weights(tmp_path / "old.safetensors", old.state_dict(), old.config, {})
     words = json.loads(json.dumps(asdict(old.config)))
-    del words["floor"]  # as it was before there was one
+    for name in fewer:
+        del words[name]  # as it was before there was one
     save_file(old.state_dict(), tmp_path / "older.safetensors", {"format": FORMAT, "net": json.dumps(words)})
     batch = Batches(SMALL.data, 3, 0, 1)[0]
     for name in ("old", "older"):
@@ -151,18 +153,19 @@ def test_a_network_without_the_floor_is_where_one_with_it_begins(tmp_path):
             torch.testing.assert_close(a, b)
         trainer.run()
         assert (trainer.net.first.weight[:, -3:] != 0).any()
-    with pytest.raises(ModelFileError, match="floor=True.* must be .*floor=False"):
+        assert (trainer.net.refinement.leave.weight != 0).any()
+    with pytest.raises(ModelFileError, match="floor=True.*refinement=3.* must be "):
         Trainer(
-            replace(SMALL, init=str(tmp_path / "old" / "weights.safetensors"), net=replace(SMALL.net, floor=False)),
+            replace(SMALL, init=str(tmp_path / "old" / "weights.safetensors"), net=replace(SMALL.net, **fewer)),
             tmp_path / "back",
         )
 
 
-def test_runs_from_before_the_floor_are_without_it(finished, tmp_path):
+def test_runs_from_before_the_floor_and_the_refinement_are_without_them(finished, tmp_path):
     about = json.loads((finished / "config.json").read_text())
-    assert about["config"]["net"].pop("floor")
+    assert about["config"]["net"].pop("floor") and about["config"]["net"].pop("refinement")
     (tmp_path / "config.json").write_text(json.dumps(about))
-    assert read_config(tmp_path / "config.json").net == replace(SMALL.net, floor=False)
+    assert read_config(tmp_path / "config.json").net == replace(SMALL.net, floor=False, refinement=0)
 
 
 def test_a_run_goes_on_without_the_weights_that_it_began_with(finished, tmp_path):

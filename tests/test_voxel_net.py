@@ -7,8 +7,8 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from understudy.voxelposenet.loss import WITHIN, _cells, loss, metric_error  # noqa: E402
-from understudy.voxelposenet.net import NetConfig, Output, VoxelPoseNet  # noqa: E402
+from understudy.voxelposenet.loss import WITHIN, _share, loss, metric_error  # noqa: E402
+from understudy.voxelposenet.net import NetConfig, Output, VoxelPoseNet, _Features  # noqa: E402
 from understudy.voxels import CELLS, EMPTY, HALF, PersonView  # noqa: E402
 
 TINY = NetConfig(channels=(8, 8, 8), channels_2d=8, lifted=2)
@@ -53,16 +53,15 @@ def said(joints, spread=0.05) -> Output:
 
 def test_shares_of_the_cells_reproduce_the_point(net):
     points = (torch.rand(5, 18, 3, generator=torch.Generator().manual_seed(1)) * 2 - 1) * (HALF - STEP)
-    index, share = _cells(points)
-    assert index.shape == share.shape == (5, 18, 8)
+    share = _share(points, net.centers)
+    assert share.shape == (5, 18, 32**3)
     assert (share >= 0).all() and torch.allclose(share.sum(-1), torch.ones(5, 18))
-    again = (net.centers[index] * share[..., None]).sum(-2)
-    torch.testing.assert_close(again, points, atol=1e-6, rtol=0)
-    assert (net.centers[index] - points[:, :, None]).abs().max() <= STEP + 1e-6  # the nearest ones
+    torch.testing.assert_close(share @ net.centers, points, atol=1e-5, rtol=0)
+    away = (net.centers - points[:, :, None]).abs().amax(-1)
+    assert away[share > 0].max() <= STEP + 1e-6  # the nearest ones
     on = net.centers[[5, 777, 32767]].reshape(1, 3, 3).repeat(1, 6, 1)
-    index, share = _cells(on)
-    best = index.gather(-1, share.argmax(-1, keepdim=True))[..., 0]
-    assert best[0, :3].tolist() == [5, 777, 32767] and share.amax(-1).min() > 0.99
+    share = _share(on, net.centers)
+    assert share.argmax(-1)[0, :3].tolist() == [5, 777, 32767] and share.amax(-1).min() > 0.99
 
 
 def test_centres_fill_the_grid_once(net):
@@ -72,14 +71,16 @@ def test_centres_fill_the_grid_once(net):
 
 
 def test_mean_of_a_sharp_distribution_is_its_cells_centre(net):
-    keypoints = people(1)[1]
-    logits = torch.zeros(1, 18, 8, 4096)
+    inputs = people(1)
+    logits = torch.zeros(1, 18, 8 * 4096)
     chosen = torch.arange(18) * 1777 + 13
-    logits.reshape(18, -1)[torch.arange(18), chosen] = 60.0
-    out = net._read(logits, torch.zeros(1, 32, 16, 16, 16), keypoints)
+    logits[0, torch.arange(18), chosen] = 60.0
+    c16, c8, _ = TINY.channels
+    features = _Features(torch.zeros(1, c16, 4096), torch.zeros(1, c8, 512), torch.zeros(1, 32, 4096))
+    out = net._read(logits.softmax(-1), features, *inputs)
     torch.testing.assert_close(out.joints[0], net.centers[chosen], atol=1e-5, rtol=0)
     assert out.spread.max() < 2e-3
-    flat = net._read(torch.zeros_like(logits), torch.zeros(1, 32, 16, 16, 16), keypoints)
+    flat = net._read(torch.full_like(logits, 1 / 32**3), features, *inputs)
     torch.testing.assert_close(flat.joints, torch.zeros(1, 18, 3), atol=1e-5, rtol=0)
     torch.testing.assert_close(flat.spread, torch.full((1, 18, 3), 2 * HALF / 12**0.5), atol=1e-3, rtol=0)
 
@@ -113,7 +114,7 @@ def test_errors_are_metric():
 def test_gradients_against_finite_differences(net):
     """The distribution learns from `cell` and `distance`; the judge from `sigma`, `within`, `seen`."""
     g = torch.Generator().manual_seed(4)
-    logits = torch.randn(1, 18, 8, 4096, generator=g, dtype=torch.float64).requires_grad_()
+    logits = torch.randn(1, 18, 8 * 4096, generator=g, dtype=torch.float64).requires_grad_()
     head = torch.randn(1, 18, 3, generator=g, dtype=torch.float64).requires_grad_()
     truth = torch.rand(1, 18, 3, generator=g, dtype=torch.float64) * 2.4 - 1.2
     truth[0, 3] = 1.5  # outside of the grid
@@ -121,10 +122,10 @@ def test_gradients_against_finite_differences(net):
     root_z = torch.full((1, 1), 2.5, dtype=torch.float64)
 
     def parts(logits, head):
-        p = logits.reshape(1, 18, -1).softmax(-1)
-        joints = p @ net.centers.double()
-        total, out = loss(logits, Output(joints, joints.detach(), head), truth, root_z, seen)
-        return total, out["cell"] + 2 * out["distance"], out["sigma"] + out["within"] + 0.5 * out["seen"]
+        centers = net.centers.double()
+        joints = logits.softmax(-1) @ centers
+        total, out = loss(logits.log_softmax(-1), centers, Output(joints, joints.detach(), head), truth, root_z, seen)
+        return total, out["cell"] + 6 * out["distance"], out["sigma"] + out["within"] + 0.5 * out["seen"]
 
     total, of_place, of_judge = parts(logits, head)
     assert total.item() == pytest.approx((of_place + of_judge).item())
@@ -145,7 +146,7 @@ def test_gradients_against_finite_differences(net):
 def test_best_sigma_holds_the_share_of_errors_that_it_should():
     """The quantile loss is least where 68 % of the errors are smaller."""
     g = torch.Generator().manual_seed(5)
-    truth, logits = torch.zeros(20, 18, 3), torch.zeros(20, 18, 8, 4096)
+    truth, scores, centers = torch.zeros(20, 18, 3), torch.zeros(20, 18, 8), torch.zeros(8, 3)
     joints = 0.1 * torch.randn(20, 18, 3, generator=g)
     root_z, seen = torch.full((20, 1), 3.0), torch.zeros(20, 18, dtype=torch.bool)
     errors = metric_error(joints, truth, root_z).flatten()
@@ -154,7 +155,7 @@ def test_best_sigma_holds_the_share_of_errors_that_it_should():
     def value(sigma) -> float:
         out = said(joints)
         out.head[..., 0] = sigma.log()
-        return float(loss(logits, out, truth, root_z, seen)[1]["sigma"])
+        return float(loss(scores, centers, out, truth, root_z, seen)[1]["sigma"])
 
     assert value(where) < min(value(where * 1.15), value(where / 1.15))
     assert WITHIN == 0.1
@@ -224,8 +225,9 @@ def test_the_floor_may_be_left_out():
 
 @pytest.mark.parametrize("inside", [True, False])
 @pytest.mark.parametrize("floor", [True, False])
-def test_sizes(inside, floor):
-    out = VoxelPoseNet(NetConfig((8, 12, 16), 8, 3, inside, floor)).eval()(*people(3))
+@pytest.mark.parametrize("refinement", [0, 2])
+def test_sizes(inside, floor, refinement):
+    out = VoxelPoseNet(NetConfig((8, 12, 16), 8, 3, inside, floor, refinement)).eval()(*people(3))
     assert out.joints.shape == out.spread.shape == out.head.shape == (3, 18, 3)
     assert all(torch.isfinite(t).all() for t in out)
 
@@ -237,11 +239,14 @@ def test_learns_eight_people_by_heart():
     batch = Samples(capsule_bank(2, seed=3, points=2000), seed=5).batch(0, 8)
     torch.manual_seed(0)
     net = VoxelPoseNet(NetConfig(channels=(8, 16, 32), channels_2d=16, lifted=4))
-    optimizer = torch.optim.Adam(net.parameters(), lr=3e-2)
+    gently = [p for name, p in net.named_parameters() if name.startswith("refinement")]
+    rest = [p for name, p in net.named_parameters() if not name.startswith("refinement")]
+    optimizer = torch.optim.Adam([{"params": rest}, {"params": gently, "lr": 2e-3}], lr=3e-2)
     errors = []
     for _ in range(18):
-        logits, out = net.scores(batch.depth, batch.keypoints, batch.root_z, batch.floor)
-        total, parts = loss(logits, out, batch.joints, batch.root_z, batch.in_view & ~batch.occluded)
+        scores, out = net.scores(batch.depth, batch.keypoints, batch.root_z, batch.floor)
+        seen = batch.in_view & ~batch.occluded
+        total, parts = loss(scores, net.centers, out, batch.joints, batch.root_z, seen)
         optimizer.zero_grad()
         total.backward()
         optimizer.step()

@@ -6,6 +6,8 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
+from types import MappingProxyType
+from typing import Final
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -17,6 +19,9 @@ from understudy.files import write_atomically
 from understudy.voxelposenet.net import NetConfig, VoxelPoseNet
 
 FORMAT = "understudy-voxelposenet/1"
+
+WITHOUT: Final = MappingProxyType({"floor": False, "refinement": 0})
+"""What networks were that were made before `NetConfig` could say it"""
 
 
 def save_weights(path: Path, state: Mapping[str, Tensor], config: NetConfig, about: Mapping[str, str]) -> None:
@@ -32,7 +37,7 @@ def load_net(path: Path) -> VoxelPoseNet:
     if words.get("format") != FORMAT:
         raise ModelFileError(f"{path}: format is {words.get('format')!r}, must be {FORMAT!r}")
     try:
-        sizes = {"floor": False, **json.loads(words["net"])}  # before there was one
+        sizes = {**WITHOUT, **json.loads(words["net"])}
         net = VoxelPoseNet(NetConfig(**{**sizes, "channels": tuple(sizes["channels"])}))
         net.load_state_dict(tensors)
     except (RuntimeError, KeyError, TypeError, ValueError) as e:

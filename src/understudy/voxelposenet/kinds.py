@@ -17,7 +17,7 @@ from understudy.synthetic.samples import Batch
 from understudy.voxelposenet import paper_data
 from understudy.voxelposenet.checkpoint import load_net, save_weights
 from understudy.voxelposenet.loss import loss
-from understudy.voxelposenet.net import VoxelPoseNet
+from understudy.voxelposenet.net import NetConfig, VoxelPoseNet
 from understudy.voxelposenet.paper_lifter import sigma_of_score
 from understudy.voxelposenet.paper_net import PaperNet, paper_loss
 from understudy.voxelposenet.tensorflow_weights import read_paper_weights, save_paper_weights
@@ -72,7 +72,7 @@ class Kind(Protocol):
 class DefaultKind:
     """`VoxelPoseNet` with its loss."""
 
-    readers = ("score", "features", "embedding", "judge")
+    readers = ("score", "features", "embedding", "judge", "refinement.embedding", "refinement.leave")
 
     def __init__(self, config: TrainConfig, device: torch.device):
         self.config = config
@@ -87,8 +87,8 @@ class DefaultKind:
 
     def learn(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
         with torch.autocast(batch.depth.device.type, torch.bfloat16, enabled=self.config.bf16):
-            logits, output = self.net.scores(batch.depth, batch.keypoints, batch.root_z, batch.floor)
-        return loss(logits, output, batch.joints, batch.root_z, batch.in_view & ~batch.occluded)
+            scores, output = self.net.scores(batch.depth, batch.keypoints, batch.root_z, batch.floor)
+        return loss(scores, self.net.centers, output, batch.joints, batch.root_z, batch.in_view & ~batch.occluded)
 
     def estimate(self, net: nn.Module, batch: Batch) -> Estimate:
         return read_default(net, batch)
@@ -104,7 +104,7 @@ class DefaultKind:
     def load(self, path: Path) -> None:
         given = load_net(path)
         wanted = self.config.net
-        if given.config not in (wanted, replace(wanted, floor=False)):
+        if given.config not in _beginnings(wanted):
             raise ModelFileError(f"{path}: weights of a network of {given.config}, must be {wanted}")
         self.net.load_state_dict(_widened(given.state_dict(), self.net.state_dict()))
 
@@ -154,15 +154,19 @@ class PaperKind:
         self.net.load_variables(weights, str(path))
 
 
+def _beginnings(wanted: NetConfig) -> list[NetConfig]:
+    """Networks whose weights one with more inputs and layers can begin with."""
+    return [wanted, replace(wanted, refinement=0), replace(wanted, floor=False, refinement=0)]
+
+
 def _widened(state: Mapping[str, Tensor], like: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Weights of a network without the floor, for one with it: of the inputs that are new, last of all, it takes no
-    notice yet.
+    """Weights of a network with fewer inputs and layers, for one like `like`, which says the same: of inputs that are
+    new, last of all, it takes no notice yet, and new layers are fresh.
     """
-    out = {}
+    out = dict(like)
     for name, tensor in state.items():
-        wide = torch.zeros_like(like[name])
-        wide[tuple(slice(n) for n in tensor.shape)] = tensor
-        out[name] = wide
+        out[name] = torch.zeros_like(like[name])
+        out[name][tuple(slice(n) for n in tensor.shape)] = tensor
     return out
 
 

@@ -26,7 +26,7 @@ from understudy.files import write_atomically
 from understudy.skeleton import N_JOINTS
 from understudy.synthetic.samples import Batch
 from understudy.voxelposenet.data import Batches, DataConfig
-from understudy.voxelposenet.loss import COVERED, WITHIN, _distance, metric_error
+from understudy.voxelposenet.loss import COVERED, WITHIN, metric_error, to_metric
 from understudy.voxels import HALF
 
 _FRESH = 64  # new people per round
@@ -99,7 +99,8 @@ class BatchSource(Protocol):
 def mlp_loss(joints: Tensor, judged: Tensor, truth: Example) -> Tensor:
     """L1 in metres over joints inside the network's grid, and the judge's quantile and cross-entropy losses."""
     inside = (truth.joints.abs() < HALF).all(-1).float()
-    position = (_distance(joints, truth.joints, truth.root_z) * inside).sum() / inside.sum().clamp_min(1)
+    off = to_metric(joints, truth.root_z) - to_metric(truth.joints, truth.root_z)
+    position = (off.abs().sum(-1) * inside).sum() / inside.sum().clamp_min(1)
     error = metric_error(joints, truth.joints, truth.root_z).detach()
     surprise = error.clamp_min(1e-3).log() - judged[:, 0]
     sigma = torch.maximum(COVERED * surprise, (COVERED - 1) * surprise).mean()

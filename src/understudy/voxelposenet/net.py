@@ -4,7 +4,8 @@ Made for a CPU. What the paper does at 64^3 with 64 channels happens here at 16^
 4 x 4 x 4 cells into channels, and everything that is constant along z (the score maps) passes through a 2D trunk whose
 result is added to the 3D features. The last layer unfolds to 32^3 scores per joint; their softmax is the joint's
 distribution.
-Where the floor is known, each cell is also told how high above it it is.
+Where the floor is known, each cell is also told how high above it it is. In the end the joints look at each other
+(`refinement`).
 All inputs and outputs are in the coordinates of `understudy.voxels.PersonView`.
 """
 
@@ -19,6 +20,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from understudy.skeleton import N_JOINTS
+from understudy.voxelposenet.refinement import WIDTH, Refinement, told
 from understudy.voxels import CELL, CELLS, EMPTY, HALF, LIMIT
 
 FOLD = 4
@@ -43,17 +45,28 @@ class NetConfig:
     """use what lies in front of and behind the seen surface (free, hidden), not only the surface"""
     floor: bool = True
     """use the floor, where one is given"""
+    refinement: int = 3
+    """layers in which the joints look at each other; 0: none"""
 
 
 class Output(NamedTuple):
     """What the network says of each person."""
 
     joints: Float[Tensor, "b 18 3"]
-    """mean of each joint's distribution, metres, view coordinates"""
+    """metres, view coordinates: the mean of each joint's distribution, refined"""
     spread: Float[Tensor, "b 18 3"]
     """standard deviation of the distribution along each axis, metres"""
     head: Float[Tensor, "b 18 3"]
     """log of sigma (metres; 68 % of errors are smaller), logit of 'within 10 cm', logit of 'seen by the camera'"""
+
+
+class _Features(NamedTuple):
+    """What is known of each cell, besides the scores."""
+
+    fine: Float[Tensor, "b c 4096"]
+    coarse: Float[Tensor, "b d 512"]
+    judged: Float[Tensor, "b 32 4096"]
+    """for the judge"""
 
 
 class _Residual(nn.Module):
@@ -105,7 +118,9 @@ class VoxelPoseNet(nn.Module):
         self.score = nn.Conv3d(c16, N_JOINTS * 8, 1)
         self.features = nn.Conv3d(c16, 32, 1)
         self.embedding = nn.Parameter(torch.zeros(N_JOINTS, 32))
-        self.judge = nn.Sequential(nn.Linear(32 + 8, 64), nn.ReLU(), nn.Linear(64, 32), nn.ReLU(), nn.Linear(32, 3))
+        self.refinement = Refinement(c16 + c8, config.refinement) if config.refinement else None
+        judged = 32 + 8 + (WIDTH if config.refinement else 0)
+        self.judge = nn.Sequential(nn.Linear(judged, 64), nn.ReLU(), nn.Linear(64, 32), nn.ReLU(), nn.Linear(32, 3))
         edges = torch.arange(2 * COARSE, dtype=torch.float32)
         self.register_buffer("centers", _sub_centers((edges + 0.5) * (2 * HALF / len(edges)) - HALF), persistent=False)
         fine = (torch.arange(CELLS, dtype=torch.float32) + 0.5) * CELL - HALF
@@ -120,13 +135,19 @@ class VoxelPoseNet(nn.Module):
         floor: Float[Tensor, "b 4"],
     ) -> Output:
         """Inputs as `understudy.voxels.PersonView` makes them. See `Output`."""
-        _, output = self.scores(depth, keypoints, root_z, floor)
-        return output
+        logits, features = self._logits(depth, keypoints, root_z, floor)
+        return self._read(logits.softmax(-1), features, depth, keypoints, root_z, floor)
 
     def scores(
         self, depth: Tensor, keypoints: Tensor, root_z: Tensor, floor: Tensor
-    ) -> tuple[Float[Tensor, "b 18 8 4096"], Output]:
-        """Also the logits over the 32^3 cells: 8 sub-cells (z, y, x) of each of the 16^3 (z, y, x)."""
+    ) -> tuple[Float[Tensor, "b 18 32768"], Output]:
+        """Also the logarithm of each joint's distribution over the 32^3 cells, in the order of `centers`."""
+        logits, features = self._logits(depth, keypoints, root_z, floor)
+        scores = logits.log_softmax(-1)
+        return scores, self._read(scores.exp(), features, depth, keypoints, root_z, floor)
+
+    def _logits(self, depth: Tensor, keypoints: Tensor, root_z: Tensor, floor: Tensor) -> tuple[Tensor, _Features]:
+        """Scores (b, 18, 32768) before they become distributions."""
         flat = self.trunk_2d(self.maps(self._flat_input(depth, keypoints, root_z, floor)))
         b, c16 = depth.shape[0], self.config.channels[0]
         added, lifted = self.lift(flat).split([c16, COARSE * self.config.lifted], 1)
@@ -135,10 +156,10 @@ class VoxelPoseNet(nn.Module):
         x8 = self.block8(self.down8(x16))
         x4 = self.block4(self.down4(x8))
         x8 = self.merge8(F.relu(x8 + self.up8(x4)))
-        x16 = self.merge16(F.relu(x16 + self.up16(x8)))
-        logits = self.score(x16).reshape(b, N_JOINTS, 8, COARSE**3).float()
+        x16 = self.merge16(F.relu(x16 + self.up16(x8))).flatten(2)
+        logits = _each_cell(self.score, x16).reshape(b, N_JOINTS, -1).float()
         # The judge must not bend what it judges: it sees features and distribution, but sends no gradient into them.
-        return logits, self._read(logits, self.features(x16.detach()), keypoints)
+        return logits, _Features(x16, x8.flatten(2), _each_cell(self.features, x16.detach()))
 
     def _flat_input(self, depth: Tensor, keypoints: Tensor, root_z: Tensor, floor: Tensor) -> Tensor:
         """Score maps; the nearest depth, and the floor's, each with its mask."""
@@ -186,20 +207,41 @@ class VoxelPoseNet(nn.Module):
             parts += [*((height / h).clamp(-1, 1) * known for h in _HEIGHTS), known]
         return torch.cat([p.to(lifted.dtype) for p in parts], 1)
 
-    def _read(self, logits: Tensor, features: Tensor, keypoints: Tensor) -> Output:
-        """Means, spreads, and the judge's word from features where each joint is believed to be."""
-        b = logits.shape[0]
-        p = logits.reshape(b, N_JOINTS, -1).softmax(-1)
-        mean = p @ self.centers
-        spread = (p @ self.centers**2 - mean**2).clamp_min(1e-6).sqrt()
-        place = p.detach().reshape(b, N_JOINTS, 8, -1).sum(2)
-        local = place @ features.float().reshape(b, features.shape[1], -1).transpose(1, 2)
-        uv, score = keypoints[..., :2], keypoints[..., 2:]
-        off = ((mean[..., :2] - uv).abs() / 0.1).clamp_max(5) * (score > 0)
+    def _read(
+        self, p: Tensor, features: _Features, depth: Tensor, keypoints: Tensor, root_z: Tensor, floor: Tensor
+    ) -> Output:
+        """Means and spreads of the distributions p (b, 18, 32768), refined, and the judge's word, from features where
+        each joint is believed to be.
+        """
+        b = p.shape[0]
+        mean, square = (p @ torch.cat([self.centers, self.centers**2], 1)).split(3, -1)
+        spread = (square - mean**2).clamp_min(1e-6).sqrt()
         peak = p.amax(-1, keepdim=True).clamp_min(1e-6).log() / 5
+        place = p.detach().reshape(b, N_JOINTS, 8, -1).sum(2)
+        at_joints = place @ features.judged.float().transpose(1, 2)
+        joints, rows = mean, []
+        if self.refinement is not None:
+            place8 = 8 * F.avg_pool3d(place.unflatten(-1, (COARSE, COARSE, COARSE)), 2).flatten(2)
+            local = [place @ features.fine.float().transpose(1, 2), place8 @ features.coarse.float().transpose(1, 2)]
+            with torch.autocast(p.device.type, enabled=False):  # places need more digits than bfloat16 has
+                plane = floor if self.config.floor else torch.zeros_like(root_z).expand(-1, 4)
+                said = told(mean.detach(), spread.detach(), peak.detach(), depth, keypoints, root_z, plane)
+                correction, row = self.refinement(torch.cat([x.float() for x in local], -1), said)
+            joints, rows = mean + correction, [row.detach()]
+        uv, score = keypoints[..., :2], keypoints[..., 2:]
+        off = ((joints[..., :2] - uv).abs() / 0.1).clamp_max(5) * (score > 0)
         said = torch.cat([spread.log(), off, score, (score > 0).to(score.dtype), peak], -1)
-        judged = self.judge(torch.cat([local + self.embedding, said.detach()], -1))
-        return Output(mean, spread, judged)
+        judged = self.judge(torch.cat([at_joints + self.embedding, said.detach(), *rows], -1))
+        return Output(joints, spread, judged)
+
+
+def _each_cell(layer: nn.Conv3d, cells: Float[Tensor, "b c n"]) -> Tensor:
+    """A 1x1x1 convolution whose result lies joint by joint in memory, where the softmax reads it: in training, the
+    convolution's own order costs a third of a step.
+    """
+    assert layer.bias is not None
+    weight = layer.weight.flatten(1).expand(cells.shape[0], -1, -1)
+    return torch.bmm(weight, cells) + layer.bias[:, None]
 
 
 def _sub_centers(edge: Tensor) -> Float[Tensor, "32768 3"]:

@@ -34,7 +34,7 @@ from understudy.files import read_json, write_atomically
 from understudy.synthetic.samples import Batch
 from understudy.synthetic.sensors import SENSORS
 from understudy.voxelposenet import curves, kinds, records, validation
-from understudy.voxelposenet.checkpoint import load_checkpoint, save_checkpoint
+from understudy.voxelposenet.checkpoint import WITHOUT, load_checkpoint, save_checkpoint
 from understudy.voxelposenet.data import Batches
 from understudy.voxelposenet.optimizers import Optimizers
 from understudy.voxelposenet.processes import Stop, World
@@ -269,7 +269,7 @@ def read_config(path: Path, base: TrainConfig | None = None) -> TrainConfig:
 def _completed(config: Mapping[str, Any]) -> dict[str, Any]:
     """The configuration of a run with what runs did before it could be said."""
     net = config.get("net")
-    return {"optimizer": "adamw", **config} | ({"net": {"floor": False, **net}} if isinstance(net, dict) else {})
+    return {"optimizer": "adamw", **config} | ({"net": {**WITHOUT, **net}} if isinstance(net, dict) else {})
 
 
 def _worker(number: int) -> None:
