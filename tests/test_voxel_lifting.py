@@ -5,13 +5,14 @@ import hashlib
 import numpy as np
 import pytest
 
-from understudy import methods, recordings
+from understudy import methods, recordings, voxels
 from understudy.errors import UnderstudyError
+from understudy.floor import measured_floor
 from understudy.registration import register
 from understudy.roots import Root
-from understudy.skeleton import JOINT
+from understudy.skeleton import JOINT, TORSO
 from understudy.types import Keypoints2D, Person, RegisteredDepth, RegisteredFrame
-from understudy.voxel_lifting import VoxelLifter, choose
+from understudy.voxel_lifting import VoxelLifter, choose, pooled
 
 
 @pytest.fixture(scope="module")
@@ -68,6 +69,43 @@ def test_something_before_the_trunk_does_not_take_the_root(scene):
     assert z[int(neck[1]), int(neck[0])] == np.float32(0.5)
 
 
+def test_the_doubtful_are_looked_at_again_from_their_trunk(scene, monkeypatch):
+    """The first look is from the root, the second from where the trunk was found; both are pooled."""
+    frame, _, seen = scene
+    once, twice = VoxelLifter(doubtful=0), VoxelLifter(doubtful=1)
+    looks: list[list[np.ndarray]] = []
+    lift = VoxelLifter._lift
+
+    def spied(self, frame, cloud, floor, each):
+        looks.append([root.point for _, root in each])
+        return lift(self, frame, cloud, floor, each)
+
+    monkeypatch.setattr(VoxelLifter, "_lift", spied)
+    first = once.lift(frame, seen)
+    assert [len(each) for each in looks] == [len(looks[0]), 0]
+    looks.clear()
+    both = twice.lift(frame, seen)
+    np.testing.assert_allclose(looks[1], [p.keypoints[TORSO].mean(0) for p in first])
+    floor = measured_floor(voxels.cloud(frame.depth, voxels.ENOUGH))
+    for person, point, a, b in zip(seen, looks[1], first, both, strict=True):
+        cloud = voxels.cloud(frame.depth, voxels.ENOUGH)
+        (second,) = lift(twice, frame, cloud, floor, [(person, Root(point, 1.0, "depth"))])
+        assert np.abs(second.keypoints - a.keypoints).max() > 1e-3
+        np.testing.assert_allclose(b.keypoints, pooled(a, second).keypoints, atol=1e-4)
+    nobody = VoxelLifter(doubtful=0).lift(frame, seen)
+    assert all((a.keypoints == b.keypoints).all() for a, b in zip(first, nobody, strict=True))
+
+
+def test_pooled_looks_are_weighted_by_their_certainty():
+    (a, _), (b, _) = at(2.0, 0.9, 1.0), at(2.3, 0.6, 1.0)
+    a.sigma_m[:] = 0.05
+    one = pooled(a, b)
+    np.testing.assert_allclose(one.keypoints[:, 2], 2.0 * 0.8 + 2.3 * 0.2)
+    np.testing.assert_allclose(one.confidence, 0.9 * 0.8 + 0.6 * 0.2)
+    np.testing.assert_allclose(one.sigma_m, 0.05 * 0.8 + 0.1 * 0.2)
+    assert one.source == a.source and one.keypoints_2d is a.keypoints_2d
+
+
 def at(z: float, confidence: float, support: float) -> tuple[Person, Root]:
     """Somebody whom the network puts at distance z, and the place that it was shown."""
     joints = np.zeros((18, 3)) + (0.0, 0.0, z)
@@ -110,6 +148,8 @@ def test_nobody_and_nothing(scene):
 def test_wrong_names(tmp_path):
     with pytest.raises(UnderstudyError, match="assembly 'glue': must be one of 'uncertainty', 'paper', 'network'"):
         VoxelLifter(assembly="glue")
+    with pytest.raises(UnderstudyError, match=r"doubtful 1.5: must be in \[0, 1\]"):
+        VoxelLifter(doubtful=1.5)
     with pytest.raises(UnderstudyError, match="method 'naive' has none"):
         methods.create("naive", weights=tmp_path / "x.onnx")
     with pytest.raises(UnderstudyError, match="no such file"):

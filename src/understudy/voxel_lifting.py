@@ -1,13 +1,16 @@
 """The voxel method: roots, person's view, network, assembly. `VoxelLifter` names the stages in order.
 
 Where several places compete for a person (an occluder, the background), the network looks at each, and the one in which
-it believes most wins.
+it believes most wins. People of whom it is not sure are looked at again, from where it found their trunk: their voxels
+fall otherwise, so both looks err in part independently, and their mean errs less.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 from jaxtyping import Float32
@@ -24,18 +27,32 @@ from understudy.types import INFERRED, OBSERVED, Keypoints2D, Person, Registered
 from understudy.voxelposenet.predictor import Prediction, Predictor, keypoint_input
 from understudy.voxels import PersonView
 
+DOUBTFUL: Final = 0.9
+"""Mean confidence of a person's joints, below which the person is looked at again."""
+
 _CROWDING = 1.0  # log odds that a place loses because somebody stands there already
 _CROWDED = 0.25  # metres: trunks of two people are hardly ever as near as that
+_NEAREST = 0.2  # metres before the camera: from there on a trunk is looked at
 
 
 class VoxelLifter:
     """Keypoints and depth -> 3D joints by the voxel network; every joint of everybody, hidden ones too."""
 
-    def __init__(self, min_score: float = 0.2, weights: Path | None = None, assembly: str = "uncertainty"):
-        """min_score: 2D keypoints with a lower score are not shown to the network. assembly: one of ASSEMBLIES."""
+    def __init__(
+        self,
+        min_score: float = 0.2,
+        weights: Path | None = None,
+        assembly: str = "uncertainty",
+        doubtful: float = DOUBTFUL,
+    ):
+        """min_score: 2D keypoints with a lower score are not shown to the network. assembly: one of ASSEMBLIES.
+        doubtful: mean confidence below which people are looked at again, in [0, 1]; at 0, nobody is.
+        """
         if assembly not in ASSEMBLIES:
             raise UnderstudyError(f"assembly {assembly!r}: must be {one_of(ASSEMBLIES)}")
-        self.min_score = min_score
+        if not 0 <= doubtful <= 1:
+            raise UnderstudyError(f"doubtful {doubtful}: must be in [0, 1]")
+        self.min_score, self.doubtful = min_score, doubtful
         self.predictor = Predictor(weights)
         self._assemble = ASSEMBLIES[assembly]
 
@@ -50,10 +67,22 @@ class VoxelLifter:
         lifted = iter(self._lift(frame, cloud, floor, each))
         candidates = [[next(lifted) for _ in r] for r in roots]
         chosen = choose(candidates, roots)
-        return [
+        out = [
             Person.failure(person, "no usable 2D keypoint") if k is None else several[k]
             for person, several, k in zip(people, candidates, chosen, strict=True)
         ]
+        at = {i: several[k] for i, (several, k) in enumerate(zip(roots, chosen, strict=True)) if k is not None}
+        again = {i: root for i in at if (root := self._again(out[i], at[i])) is not None}
+        second = self._lift(frame, cloud, floor, [(people[i], root) for i, root in again.items()])
+        for i, look in zip(again, second, strict=True):
+            out[i] = pooled(out[i], look)
+        return out
+
+    def _again(self, person: Person, root: Root) -> Root | None:
+        """From where to look at somebody again who was looked at from `root`; None where once is enough."""
+        trunk = person.keypoints[TORSO].mean(0)
+        doubtful = person.confidence.mean() < self.doubtful and root.evidence == "depth"
+        return replace(root, point=trunk) if doubtful and trunk[2] > _NEAREST else None
 
     def _lift(
         self,
@@ -80,6 +109,18 @@ class VoxelLifter:
         observed = (said.seen > 0.5) & (rows[:, 2] > 0) & (root.evidence == "depth")
         source = np.where(observed, OBSERVED, INFERRED)
         return Person(seen, joints, said.confidence, said.sigma, tuple(source.tolist()))
+
+
+def pooled(first: Person, second: Person) -> Person:
+    """Two looks at one person as one: each joint counts as much as its look is sure."""
+    looks = (first, second)
+    weight = np.stack([look.sigma_m**-2 for look in looks])
+    weight /= weight.sum(0)
+    joints = np.einsum("lj,ljk->jk", weight, np.stack([look.keypoints for look in looks]))
+    sigma, confidence = (
+        (weight * np.stack([getattr(look, name) for look in looks])).sum(0) for name in ("sigma_m", "confidence")
+    )
+    return replace(first, keypoints=joints, sigma_m=sigma, confidence=confidence)
 
 
 def choose(candidates: Sequence[Sequence[Person]], roots: Sequence[Sequence[Root]]) -> list[int | None]:

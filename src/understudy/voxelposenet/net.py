@@ -143,8 +143,9 @@ class VoxelPoseNet(nn.Module):
     ) -> tuple[Float[Tensor, "b 18 32768"], Output]:
         """Also the logarithm of each joint's distribution over the 32^3 cells, in the order of `centers`."""
         logits, features = self._logits(depth, keypoints, root_z, floor)
-        scores = logits.log_softmax(-1)
-        return scores, self._read(scores.exp(), features, depth, keypoints, root_z, floor)
+        with torch.autocast(logits.device.type, enabled=False):  # places need more digits than bfloat16 has
+            scores = logits.log_softmax(-1)
+            return scores, self._read(scores.exp(), features, depth, keypoints, root_z, floor)
 
     def _logits(self, depth: Tensor, keypoints: Tensor, root_z: Tensor, floor: Tensor) -> tuple[Tensor, _Features]:
         """Scores (b, 18, 32768) before they become distributions."""
@@ -223,10 +224,9 @@ class VoxelPoseNet(nn.Module):
         if self.refinement is not None:
             place8 = 8 * F.avg_pool3d(place.unflatten(-1, (COARSE, COARSE, COARSE)), 2).flatten(2)
             local = [place @ features.fine.float().transpose(1, 2), place8 @ features.coarse.float().transpose(1, 2)]
-            with torch.autocast(p.device.type, enabled=False):  # places need more digits than bfloat16 has
-                plane = floor if self.config.floor else torch.zeros_like(root_z).expand(-1, 4)
-                said = told(mean.detach(), spread.detach(), peak.detach(), depth, keypoints, root_z, plane)
-                correction, row = self.refinement(torch.cat([x.float() for x in local], -1), said)
+            plane = floor if self.config.floor else torch.zeros_like(root_z).expand(-1, 4)
+            said = told(mean.detach(), spread.detach(), peak.detach(), depth, keypoints, root_z, plane)
+            correction, row = self.refinement(torch.cat(local, -1), said)
             joints, rows = mean + correction, [row.detach()]
         uv, score = keypoints[..., :2], keypoints[..., 2:]
         off = ((joints[..., :2] - uv).abs() / 0.1).clamp_max(5) * (score > 0)
