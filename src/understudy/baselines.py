@@ -215,11 +215,11 @@ class MlpPredictor(Predictor):
 
 class MlpLifter(VoxelLifter):
     """2D keypoints and the depths under them -> 3D joints, by the MLP. Roots and views are those of the network; no
-    assembly.
+    assembly, no second looks.
     """
 
     def __init__(self, weights: Path, min_score: float = 0.2):
-        self.min_score = min_score
+        self.min_score, self.doubtful = min_score, 0.0
         self.predictor = MlpPredictor(weights)
         self._assemble = of_network
 
