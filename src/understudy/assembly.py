@@ -15,7 +15,7 @@ from understudy.voxels import PersonView
 
 _SIGMA_2D = 0.04  # metres at the person: of a 2D keypoint with full score
 _SIGMA_UNSURE = 0.1  # more, for a score of 0
-_GATE = 1.0  # standard deviations beyond which 2D and network do not speak of the same place
+_GATE = 0.8  # standard deviations beyond which 2D and network do not speak of the same place
 
 _LIMBS = (("shoulder", "elbow", 0.282), ("elbow", "wrist", 0.26), ("hip", "knee", 0.403), ("knee", "ankle", 0.412))
 _ENDS = np.array([[JOINT[f"{s}_{a}"], JOINT[f"{s}_{b}"]] for a, b, _ in _LIMBS for s in ("right", "left")])
@@ -46,12 +46,14 @@ def of_paper(said: Prediction, rows: Rows, view: PersonView) -> Joints:
 
 
 def by_uncertainty(said: Prediction, rows: Rows, view: PersonView) -> Joints:
-    """The network's joint, drawn to the 2D keypoint as far as each is sure of itself, and to bones of human length."""
+    """The network's joint, drawn to the 2D keypoint as far as each is sure of itself and the camera sees the joint (of
+    a hidden one the keypoint is a guess, which the network has weighed), and to bones of human length.
+    """
     network = said.spread[:, :2].mean(1)
     keypoint = _SIGMA_2D + _SIGMA_UNSURE * (1 - rows[:, 2].astype(np.float64)) ** 2
     gap = rows[:, :2] - said.joints[:, :2]
     agree = (rows[:, 2] > 0) & (np.linalg.norm(gap, axis=1) < _GATE * np.hypot(network, keypoint))
-    share = np.where(agree, network**2 / (network**2 + keypoint**2), 0.0)
+    share = said.seen * np.where(agree, network**2 / (network**2 + keypoint**2), 0.0)
     fused = said.joints.copy()
     fused[:, :2] += share[:, None] * gap
     spread = said.spread.copy()
