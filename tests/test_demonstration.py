@@ -11,6 +11,7 @@ from demonstration_scenes import camera, cast, door_demonstration, minimum_jerk,
 from scipy.spatial.transform import Rotation
 
 from understudy.demonstration import clock, storage
+from understudy.demonstration.actor import in_question, reaching_hands
 from understudy.demonstration.alignment import align, on_floor, phase
 from understudy.demonstration.demonstration import FREE, OCCUPIED, UNKNOWN, Demonstration, Segments
 from understudy.demonstration.known_motion import part_points
@@ -20,6 +21,8 @@ from understudy.demonstration.segments import MOVING, find_segments, measure_mot
 from understudy.errors import RecordingError, UnderstudyError
 from understudy.floor import find_floor, world_from_camera
 from understudy.geometry import rigid, transform_points
+from understudy.skeleton import BONES, JOINT
+from understudy.tracking import PersonTrack
 from understudy.trajectories import PlanarTrack, PoseTrack
 from understudy.types import RegisteredDepth
 from understudy.voxels import cloud
@@ -397,3 +400,26 @@ def test_points_and_camera_agree():
     depth = cast(T, [])
     world = transform_points(T, cloud(depth).astype(np.float64))
     assert np.abs(world[:, 2]).max() < 1e-5 and camera().width == depth.camera.width
+
+
+@pytest.mark.parametrize(
+    "right, left, tried",
+    [
+        (0.5, 0.1, ["right"]),
+        (0.1, 0.5, ["left"]),
+        (0.5, 0.4, ["right", "left"]),
+        (0.006, 0.001, ["right", "left"]),  # neither is a reach: the object must tell
+        (-0.2, -0.2, ["left", "right"]),
+    ],
+)
+def test_hands_that_hardly_reach_are_both_tried(right, left, tried):
+    """right, left: metres by which a wrist is farther from the trunk than at rest, for a second."""
+    n = 31
+    joints = np.zeros((n, 18, 3))
+    joints[:, JOINT["right_wrist"], 0], joints[:, JOINT["left_wrist"], 0] = 0.33 + right, 0.33 + left
+    sure, observed = np.full((n, 18), 1e-3), np.ones((n, 18), bool)
+    times = np.linspace(0, 1, n)
+    track = PersonTrack(0, times, joints, sure, observed, np.full((n, 18), "observed"), np.ones(len(BONES)))
+    hands = reaching_hands([track], np.eye(4))
+    assert hands[0].reaching_s == pytest.approx(max(right, left, 0), rel=0.05, abs=1e-9)
+    assert [hand.side for hand in in_question(hands)] == tried

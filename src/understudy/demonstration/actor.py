@@ -13,6 +13,8 @@ from understudy.skeleton import JOINT, rows
 from understudy.tracking import PersonTrack
 
 _AT_REST = 0.33  # metres: a hanging hand is hardly farther from the trunk's axis
+_ALIKE = 0.6  # share of the longest reach from which on another hand is tried, too
+_CLEAR = 0.03  # metres times seconds: less is no reach but an error of the joints, and tells hands apart badly
 _TRUNK = rows("neck", "right_hip", "left_hip")
 
 
@@ -42,3 +44,9 @@ def reaching_hands(tracks: Sequence[PersonTrack], T_world_cam: np.ndarray) -> li
     if not out:
         raise UnderstudyError("there is nobody in the recording whose joints could be estimated")
     return sorted(out, key=lambda c: -c.reaching_s)
+
+
+def in_question(hands: Sequence[Candidate]) -> list[Candidate]:
+    """The hands, two at most, that may be the one that acts, of those that `reaching_hands` gives."""
+    longest = hands[0].reaching_s
+    return [h for h in hands if longest < _CLEAR or h.reaching_s >= _ALIKE * longest][:2]

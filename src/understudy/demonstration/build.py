@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 import understudy
 from understudy.demonstration import clock
-from understudy.demonstration.actor import Candidate, reaching_hands
+from understudy.demonstration.actor import Candidate, in_question, reaching_hands
 from understudy.demonstration.body_tracks import hand_track, hold, on_the_floor, torso_track
 from understudy.demonstration.demonstration import Demonstration
 from understudy.demonstration.known_motion import part_points
@@ -44,7 +44,6 @@ _POSES = 24  # of the moving part, between closed and open
 _BAR = 9  # points along the handle
 _CACHED = 24  # decoded frames kept in memory
 _SURE_M = 0.075  # sigma of a hand that may say that it has left: one that the body hides is often far off
-_ALIKE = 0.6  # a hand that reaches at least so much as the first is tried, too
 
 
 @dataclass(frozen=True)
@@ -212,11 +211,11 @@ def _object(
 
 
 def _found(frames: Frames, seen: Sequence[Sequence[Person]], body: _Body, hands: Sequence[Candidate]) -> ObjectTrack:
-    """The object that is found best with one of the hands that reach."""
+    """The object that is found best with one of the hands that may be the one that acts."""
     times = body.times[frames.rows(body.people)]
     found: list[ObjectTrack] = []
     complaints: list[UnderstudyError] = []
-    for hand in [h for h in hands if h.reaching_s >= _ALIKE * hands[0].reaching_s][:2]:
+    for hand in in_question(hands):
         track = clock.resample_poses(body.hand(hand), hand.track.times_s, times)
         sigma = np.sqrt(np.trace(track.covariance[:, :3, :3], axis1=1, axis2=2))
         try:
