@@ -1,6 +1,6 @@
 """Palms: laws of the hand's view, the network in use, reasons why there is no palm; and what the method reaches."""
 
-from dataclasses import replace
+from dataclasses import astuple, replace
 
 import numpy as np
 import pytest
@@ -311,6 +311,18 @@ def test_exported_network_says_what_torch_says() -> None:
         np.testing.assert_allclose(view.directions_from_cam(word.normal), out.normal[k].numpy(), atol=1e-3)
         np.testing.assert_allclose((word.landmarks - view.center) @ view.R.T, out.landmarks[k].numpy(), atol=1e-3)
         assert word.confidence == pytest.approx(float(out.sure[k].sigmoid()), abs=1e-3)
+
+
+@pytest.mark.parametrize("n", [1, 2, 3])
+def test_hands_do_not_depend_on_the_number_of_threads(n: int) -> None:
+    rng = np.random.default_rng(n)
+    view = HandView.of(skeleton(), "right")
+    depth = np.stack([view.depth_crop(cloud_around(view, seed=k)) for k in range(n)])
+    color = rng.normal(0, 0.5, (n, 9)).astype(np.float32)
+    image = rng.integers(0, 256, (n, PIXELS, PIXELS, 3), dtype=np.uint8)
+    for one, two in zip(*(HandPredictor(threads=t)([view] * n, depth, color, image) for t in (1, 2)), strict=True):
+        for a, b in zip(astuple(one), astuple(two), strict=True):
+            np.testing.assert_array_equal(a, b)
 
 
 def _word(normal: list[float], confidence: float) -> HandPrediction:

@@ -18,6 +18,7 @@ from understudy.hands.crop import GREY, PIXELS, HandView
 
 WEIGHTS: Final = "handnormalnet.onnx"
 _OUTPUTS = ("normal", "direction", "log_kappa", "landmarks", "sure")
+_LEAST_ROWS = 2  # hands: of one alone, OpenVINO shares sums among the threads, whose number the last bits then show
 _LEAST_SPREAD = 0.01  # radians
 _DISAGREE = 0.8  # radians: predictions that differ by so much are hardly evidence for each other
 
@@ -67,8 +68,12 @@ class HandPredictor:
         if image is None:
             image = np.full((len(views), PIXELS, PIXELS, 3), GREY, np.uint8)
         picture = np.ascontiguousarray(image.transpose(0, 3, 1, 2), np.float32)
-        said = self.network(depth=depth, context=context, distance=distance, color=color, sigma=sigma, image=picture)
-        normal, direction, kappa, landmarks, sure = (part.astype(np.float64) for part in said)
+        given = {
+            "depth": depth, "context": context, "distance": distance, "color": color, "sigma": sigma, "image": picture
+        }  # fmt: skip
+        if len(views) < _LEAST_ROWS:
+            given = {name: np.repeat(rows, _LEAST_ROWS, axis=0) for name, rows in given.items()}
+        normal, direction, kappa, landmarks, sure = (part.astype(np.float64) for part in self.network(**given))
         normal, direction = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in (normal, direction))
         return [
             HandPrediction(
