@@ -225,8 +225,8 @@ class VoxelPoseNet(nn.Module):
             place8 = 8 * F.avg_pool3d(place.unflatten(-1, (COARSE, COARSE, COARSE)), 2).flatten(2)
             local = [place @ features.fine.float().transpose(1, 2), place8 @ features.coarse.float().transpose(1, 2)]
             plane = floor if self.config.floor else torch.zeros_like(root_z).expand(-1, 4)
-            said = told(mean.detach(), spread.detach(), peak.detach(), depth, keypoints, root_z, plane)
-            correction, row = self.refinement(torch.cat(local, -1), said)
+            about = told(mean.detach(), spread.detach(), peak.detach(), depth, keypoints, root_z, plane)
+            correction, row = self.refinement(torch.cat(local, -1), about)
             joints, rows = mean + correction, [row.detach()]
         uv, score = keypoints[..., :2], keypoints[..., 2:]
         off = ((joints[..., :2] - uv).abs() / 0.1).clamp_max(5) * (score > 0)
@@ -237,7 +237,7 @@ class VoxelPoseNet(nn.Module):
 
 def _each_cell(layer: nn.Conv3d, cells: Float[Tensor, "b c n"]) -> Tensor:
     """A 1x1x1 convolution whose result lies joint by joint in memory, where the softmax reads it: in training, the
-    convolution's own order costs a third of a step.
+    convolution's own order costs a tenth of a step.
     """
     assert layer.bias is not None
     weight = layer.weight.flatten(1).expand(cells.shape[0], -1, -1)
