@@ -1,16 +1,17 @@
 """The voxel method as a whole, with the weights that come with the package."""
 
 import hashlib
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from understudy import methods, recordings, voxels
 from understudy.errors import UnderstudyError
-from understudy.floor import measured_floor
+from understudy.floor import Floor, measured_floor
 from understudy.registration import register
 from understudy.roots import Root
-from understudy.skeleton import JOINT, TORSO
+from understudy.skeleton import FLIP, JOINT, TORSO
 from understudy.types import Keypoints2D, Person, RegisteredDepth, RegisteredFrame
 from understudy.voxel_lifting import VoxelLifter, choose, pooled
 
@@ -70,15 +71,16 @@ def test_something_before_the_trunk_does_not_take_the_root(scene):
 
 
 def test_the_doubtful_are_looked_at_again_from_their_trunk(scene, monkeypatch):
-    """The first look is from the root, the second from where the trunk was found; both are pooled."""
+    """The first look is from the root, the second from where the trunk was found, in a mirror; both are pooled."""
     frame, _, seen = scene
     once, twice = VoxelLifter(doubtful=0), VoxelLifter(doubtful=1)
     looks: list[list[np.ndarray]] = []
     lift = VoxelLifter._lift
 
-    def spied(self, frame, cloud, floor, each):
+    def spied(self, frame, cloud, floor, each, mirrored=False):
+        assert mirrored == (len(looks) % 2 == 1)  # every second call
         looks.append([root.point for _, root in each])
-        return lift(self, frame, cloud, floor, each)
+        return lift(self, frame, cloud, floor, each, mirrored)
 
     monkeypatch.setattr(VoxelLifter, "_lift", spied)
     first = once.lift(frame, seen)
@@ -89,11 +91,35 @@ def test_the_doubtful_are_looked_at_again_from_their_trunk(scene, monkeypatch):
     floor = measured_floor(voxels.cloud(frame.depth, voxels.ENOUGH))
     for person, point, a, b in zip(seen, looks[1], first, both, strict=True):
         cloud = voxels.cloud(frame.depth, voxels.ENOUGH)
-        (second,) = lift(twice, frame, cloud, floor, [(person, Root(point, 1.0, "depth"))])
+        (second,) = lift(twice, frame, cloud, floor, [(person, Root(point, 1.0, "depth"))], mirrored=True)
         assert np.abs(second.keypoints - a.keypoints).max() > 1e-3
         np.testing.assert_allclose(b.keypoints, pooled(a, second).keypoints, atol=1e-4)
     nobody = VoxelLifter(doubtful=0).lift(frame, seen)
     assert all((a.keypoints == b.keypoints).all() for a, b in zip(first, nobody, strict=True))
+
+
+def test_a_mirrored_look_is_a_look_at_the_mirror_image(scene):
+    frame, _, seen = scene
+    lifter, cloud = VoxelLifter(), voxels.cloud(frame.depth, voxels.ENOUGH)
+    floor = measured_floor(cloud)
+    point = lifter.lift(frame, seen)[1].keypoints[TORSO].mean(0) + 0.03
+    (got,) = lifter._lift(frame, cloud, floor, [(seen[1], Root(point, 1.0, "depth"))], mirrored=True)
+    (plain,) = lifter._lift(frame, cloud, floor, [(seen[1], Root(point, 1.0, "depth"))])
+
+    to = np.array([-1.0, 1.0, 1.0])
+    K = frame.camera.K.copy()
+    K[0, 2] = frame.camera.width - 1 - K[0, 2]
+    there = RegisteredFrame(frame.color[:, ::-1], replace(frame.camera, K=K), frame.depth, 0)
+    uv = np.column_stack([frame.camera.width - 1 - seen[1].uv[:, 0], seen[1].uv[:, 1]])[FLIP]
+    person = Keypoints2D(np.where(seen[1].found[FLIP, None], uv, seen[1].uv[FLIP]), seen[1].score[FLIP])
+    assert floor is not None
+    other = Floor(floor.up * to, floor.height)
+    (want,) = lifter._lift(there, cloud * to.astype(np.float32), other, [(person, Root(point * to, 1.0, "depth"))])
+    np.testing.assert_allclose(got.keypoints, want.keypoints[FLIP] * to, atol=1e-4)
+    np.testing.assert_allclose(got.confidence, want.confidence[FLIP], atol=1e-4)
+    np.testing.assert_allclose(got.sigma_m, want.sigma_m[FLIP], atol=1e-4)
+    assert got.source == tuple(want.source[k] for k in FLIP)
+    assert np.abs(got.keypoints - plain.keypoints).max() > 1e-3
 
 
 def test_pooled_looks_are_weighted_by_their_certainty():

@@ -64,6 +64,20 @@ def test_a_keypoint_is_the_column_of_its_point_at_any_depth(seed, camera: Camera
         np.testing.assert_allclose(view.columns(camera, uv), view.from_cam(points)[:, :2], atol=1e-9)
 
 
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 10**6))
+def test_a_mirrored_view_has_the_other_x_and_leads_back_to_the_same_places(seed):
+    points = people_at(seed, 300)
+    view = PersonView.towards(points[0])
+    mirror = view.mirrored()
+    there = mirror.from_cam(points)
+    np.testing.assert_allclose(there, view.from_cam(points) * [-1, 1, 1], atol=1e-9)
+    np.testing.assert_allclose(mirror.to_cam(there), points, atol=1e-9)
+    away = np.abs(view.from_cam(points)[:, :2] / CELL % 1 - 0.5).max(1) < 0.499  # from the edges of the cells
+    cells = points[away].astype(np.float32)
+    np.testing.assert_array_equal(mirror.depth_grid(cells), view.depth_grid(cells)[..., ::-1])
+
+
 def test_no_ray_no_column():
     fisheye = Camera(
         640, 480, np.array([[200.0, 0, 320], [0, 200.0, 240], [0, 0, 1]]), "brown_conrady", (-0.3, 0, 0, 0, 0)

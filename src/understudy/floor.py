@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Float32
 
-from understudy.geometry import rigid
+from understudy.geometry import along, rigid
 from understudy.types import Person
 
 CAMERA_UP = np.array([0.0, -1.0, 0.0])
@@ -82,9 +82,10 @@ def measured_floor(points: Float32[np.ndarray, "n 3"]) -> Floor | None:
     if not len(on) or on.max() < MIN_SHARE:
         return None
     k = np.argmax(on)
-    best = points[np.abs(points @ normals[k] - heights[k]) < THICKNESS_M]
+    best = points[np.abs(along(points, normals[k : k + 1])[:, 0] - heights[k]) < THICKNESS_M]
     centre = best.mean(axis=0)
-    up = np.linalg.svd(best - centre, full_matrices=False)[2][2]
+    off = (best - centre).T
+    up = np.linalg.eigh((off[:, None] * off).sum(axis=2))[1][:, 0]
     up *= np.sign(up @ CAMERA_UP) or 1.0
     return Floor(up, float(up @ centre))
 
@@ -93,9 +94,9 @@ def _floor_share(
     points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "k 3"], heights: Float[np.ndarray, " k"]
 ) -> Float[np.ndarray, " k"]:
     """Share of the points on each plane; 0 for planes that too many are under."""
-    over = normals @ points.T - heights[:, None]  # planes x points, metres
-    on = (np.abs(over) < THICKNESS_M).mean(axis=1)
-    below = (over < -4 * THICKNESS_M).mean(axis=1)
+    over = along(points, normals) - heights  # metres
+    on = (np.abs(over) < THICKNESS_M).mean(axis=0)
+    below = (over < -4 * THICKNESS_M).mean(axis=0)
     share: np.ndarray = np.where(below > MAX_BELOW, 0.0, on)
     return share
 

@@ -41,3 +41,13 @@ def angle_between(a: Float[np.ndarray, "*n 3"], b: Float[np.ndarray, "*n 3"]) ->
     """Angle (radians, 0 to pi) between vectors. Exact for small angles too, unlike arccos of the cosine."""
     cross = np.linalg.norm(np.cross(a, b), axis=-1)
     return np.asarray(np.arctan2(cross, np.sum(a * b, axis=-1)))
+
+
+def along(points: Float[np.ndarray, "*n 3"], directions: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "*n k"]:
+    """How far each point is along each direction (dot products), for hot paths.
+
+    einsum, not @: BLAS would wake its threads for it, which then spin for a while and hold up the networks that come
+    next on the same cores.
+    """
+    out: np.ndarray = np.einsum("...i,ki->...k", points, directions)
+    return out

@@ -21,13 +21,13 @@ from understudy.assembly import ASSEMBLIES, Rows
 from understudy.errors import UnderstudyError, one_of
 from understudy.floor import Floor, measured_floor
 from understudy.roots import Root, find_roots
-from understudy.skeleton import TORSO
+from understudy.skeleton import FLIP, TORSO
 from understudy.standing import stood
 from understudy.types import INFERRED, OBSERVED, Keypoints2D, Person, RegisteredFrame
 from understudy.voxelposenet.predictor import Prediction, Predictor, keypoint_input
 from understudy.voxels import PersonView
 
-DOUBTFUL: Final = 0.9
+DOUBTFUL: Final = 0.95
 """Mean confidence of a person's joints, below which the person is looked at again."""
 
 _CROWDING = 1.0  # log odds that a place loses because somebody stands there already
@@ -73,7 +73,7 @@ class VoxelLifter:
         ]
         at = {i: several[k] for i, (several, k) in enumerate(zip(roots, chosen, strict=True)) if k is not None}
         again = {i: root for i in at if (root := self._again(out[i], at[i])) is not None}
-        second = self._lift(frame, cloud, floor, [(people[i], root) for i, root in again.items()])
+        second = self._lift(frame, cloud, floor, [(people[i], root) for i, root in again.items()], mirrored=True)
         for i, look in zip(again, second, strict=True):
             out[i] = pooled(out[i], look)
         return out
@@ -90,16 +90,23 @@ class VoxelLifter:
         cloud: Float32[np.ndarray, "n 3"],
         floor: Floor | None,
         each: Sequence[tuple[Keypoints2D, Root]],
+        mirrored: bool = False,
     ) -> list[Person]:
-        """Every pair of a person and a place. cloud: the frame's points, see `voxels.cloud`."""
+        """Every pair of a person and a place. cloud: the frame's points, see `voxels.cloud`. mirrored: the network is
+        shown the mirror image; the people are not mirrored.
+        """
         if not each:
             return []
         views = [PersonView.towards(root.point) for _, root in each]
+        if mirrored:
+            views = [view.mirrored() for view in views]
         depth = np.stack([view.depth_grid(cloud) for view in views])
         rows = np.stack(
             [keypoint_input(v, frame.camera, p, self.min_score) for v, (p, _) in zip(views, each, strict=True)]
         )
-        said = self.predictor(views, depth, rows, floor)
+        said = self.predictor(views, depth, rows[:, FLIP] if mirrored else rows, floor)
+        if mirrored:
+            said = [person.flipped() for person in said]
         return [self._person(*pair, *with_it) for pair, *with_it in zip(each, views, rows, said, strict=True)]
 
     def _person(self, seen: Keypoints2D, root: Root, view: PersonView, rows: Rows, said: Prediction) -> Person:

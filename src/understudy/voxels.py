@@ -11,7 +11,7 @@ z = Z - root_z. Cells have an edge of `CELL` in these coordinates and begin at -
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Final
 
@@ -41,7 +41,7 @@ class PersonView:
     """Where one person's grid stands in the colour camera's frame."""
 
     R_view_cam: Float[np.ndarray, "3 3"]
-    """the z axis of the view goes through the person"""
+    """the z axis of the view goes through the person; a rotation, or (`mirrored`) one with a reflection"""
     root_z: float
     """metres along that axis to the grid's centre"""
 
@@ -50,6 +50,10 @@ class PersonView:
         """The view whose centre is `point` (metres, colour camera's frame, before the camera)."""
         distance = float(np.linalg.norm(point))
         return cls(rotation_to(point / distance), distance)
+
+    def mirrored(self) -> PersonView:
+        """The same in a mirror: x has the other sign everywhere, and left and right look exchanged."""
+        return replace(self, R_view_cam=self.R_view_cam * np.array([[-1.0], [1.0], [1.0]]))
 
     def from_cam(self, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
         """Colour camera's frame -> view coordinates; NaN for points that are not before the view's camera."""
@@ -92,7 +96,7 @@ class PersonView:
         limited to +-LIMIT; `EMPTY` where nothing was measured. One value or a hundred in a column make no difference,
         so that coarse and fine sensors look alike.
         """
-        # einsum, not @: BLAS would wake its threads, and they spin on after it while the network needs the cores.
+        # einsum, not @: see `geometry.along`
         x, y, z = np.einsum("ij,nj->in", self.R_view_cam.astype(points.dtype), points)
         scale = points.dtype.type(self.root_z / CELL)
         edge = z * points.dtype.type(CELLS // 2)

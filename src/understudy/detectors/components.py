@@ -16,6 +16,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from understudy.camera import Camera
+from understudy.geometry import along
 from understudy.types import RegisteredDepth
 
 GRID_WIDTH = 160
@@ -82,7 +83,7 @@ class DepthGrid:
         """Component of each cell, from 1; 0 for the floor and where nothing was measured nearby."""
         solid = self.z > 0
         if self.floor is not None:
-            height = self.points @ self.floor[:3].astype(np.float32) + np.float32(self.floor[3])
+            height = along(self.points, self.floor[None, :3].astype(np.float32))[..., 0] + np.float32(self.floor[3])
             solid &= height > _FLOOR_TOLERANCE + 0.01 * self.z
         if not solid.any():
             return np.zeros(self.z.shape, np.int64)
@@ -201,15 +202,16 @@ def fit_floor(
         return None
     normal, offset = normal[good], offset[good]
     tolerance = (0.03 + 0.01 * upward[:, 2])[:, None]
-    on = np.abs(upward @ normal.T + offset) < tolerance
-    beneath = (sample @ normal.T + offset < -3 * (0.03 + 0.01 * sample[:, 2])[:, None]).mean(0)
+    on = np.abs(along(upward, normal) + offset) < tolerance
+    beneath = (along(sample, normal) + offset < -3 * (0.03 + 0.01 * sample[:, 2])[:, None]).mean(0)
     support = on.mean(0) - 3 * beneath
     best = int(np.argmax(support))
     if support[best] < 0.2:
         return None
     inliers = upward[on[:, best]]
     center = inliers.mean(0)
-    refined = np.linalg.svd(inliers - center, full_matrices=False)[2][2]
+    apart = (inliers - center).T
+    refined = np.linalg.eigh((apart[:, None] * apart).sum(axis=2))[1][:, 0]
     refined *= -np.sign(refined[1])
     return np.append(refined, -refined @ center)
 

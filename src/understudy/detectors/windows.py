@@ -8,6 +8,7 @@ Without depth: the whole image, and tiles of two sizes.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 import cv2
 import numpy as np
@@ -23,7 +24,8 @@ PERSON = 1.7
 """metres: a standing person's height, for windows around people who are cut off"""
 MAX_JOINED = 10
 """tiles on walls and furniture"""
-_FILL = 128  # grey level of what is hidden
+_FILL: Final = 128  # grey level of what is hidden
+_OPACITY_BITS: Final = 7  # so many that int16 holds the product of a grey level and an opacity
 
 
 @dataclass(frozen=True)
@@ -88,14 +90,16 @@ class Scene:
         to_image = np.vstack([region.to_image(size), (0, 0, 1)])
         to_color = np.vstack([self.grid.to_color(), (0, 0, 1)])
         alpha = cv2.warpAffine(
-            cells.astype(np.float32),
+            cells.astype(np.uint8) << _OPACITY_BITS,
             (np.linalg.inv(to_color) @ to_image)[:2],
             (size, size),
             flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
         )
         if not alpha.any():
             return crop
-        return (crop * (1 - alpha[..., None]) + _FILL * alpha[..., None]).astype(np.uint8)
+        opacity = cv2.merge([alpha] * 3).astype(np.int16)
+        grey = (_FILL - crop.astype(np.int16)) * opacity >> _OPACITY_BITS
+        return (crop + grey).astype(np.uint8)
 
 
 def windows(width: int, height: int, scene: Scene | None) -> list[Window]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from importlib import resources
 from pathlib import Path
 
@@ -13,6 +13,7 @@ from scipy.special import expit
 from understudy import runtime
 from understudy.camera import Camera
 from understudy.floor import Floor
+from understudy.skeleton import FLIP
 from understudy.types import Keypoints2D
 from understudy.voxels import PersonView
 
@@ -33,6 +34,10 @@ class Prediction:
     """probability of being within 10 cm"""
     seen: Float[np.ndarray, "18"]
     """probability that the camera sees the joint"""
+
+    def flipped(self) -> Prediction:
+        """Left joints as right ones, and right ones as left ones."""
+        return Prediction(*(getattr(self, field.name)[FLIP] for field in fields(self)))
 
 
 def weights_path() -> Path:
