@@ -219,7 +219,7 @@ class MlpLifter(VoxelLifter):
     """
 
     def __init__(self, weights: Path, min_score: float = 0.2):
-        self.min_score, self.doubtful = min_score, 0.0
+        self.min_score, self.second_looks = min_score, 0
         self.predictor = MlpPredictor(weights)
         self._assemble = of_network
 

@@ -7,7 +7,7 @@ fall otherwise, so both looks err in part independently, and their mean errs les
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Final
@@ -27,8 +27,8 @@ from understudy.types import INFERRED, OBSERVED, Keypoints2D, Person, Registered
 from understudy.voxelposenet.predictor import Prediction, Predictor, keypoint_input
 from understudy.voxels import PersonView
 
-DOUBTFUL: Final = 0.95
-"""Mean confidence of a person's joints, below which the person is looked at again."""
+SECOND_LOOKS: Final = 2
+"""People of a frame who are looked at again; a bound, so that crowds take no longer than they must."""
 
 _CROWDING = 1.0  # log odds that a place loses because somebody stands there already
 _CROWDED = 0.25  # metres: trunks of two people are hardly ever as near as that
@@ -43,16 +43,16 @@ class VoxelLifter:
         min_score: float = 0.2,
         weights: Path | None = None,
         assembly: str = "uncertainty",
-        doubtful: float = DOUBTFUL,
+        second_looks: int = SECOND_LOOKS,
     ):
         """min_score: 2D keypoints with a lower score are not shown to the network. assembly: one of ASSEMBLIES.
-        doubtful: mean confidence below which people are looked at again, in [0, 1]; at 0, nobody is.
+        second_looks: how many people of a frame, the least sure ones, are looked at again at most; at 0, nobody is.
         """
         if assembly not in ASSEMBLIES:
             raise UnderstudyError(f"assembly {assembly!r}: must be {one_of(ASSEMBLIES)}")
-        if not 0 <= doubtful <= 1:
-            raise UnderstudyError(f"doubtful {doubtful}: must be in [0, 1]")
-        self.min_score, self.doubtful = min_score, doubtful
+        if second_looks < 0:
+            raise UnderstudyError(f"second_looks {second_looks}: must be 0 or more")
+        self.min_score, self.second_looks = min_score, second_looks
         self.predictor = Predictor(weights)
         self._assemble = ASSEMBLIES[assembly]
 
@@ -60,7 +60,6 @@ class VoxelLifter:
         if not people:
             return []
         cloud = voxels.cloud(frame.depth, voxels.ENOUGH)
-
         floor = measured_floor(cloud)
         roots = [find_roots(person, frame.depth, frame.camera, self.min_score, floor) for person in people]
         each = [(person, root) for person, several in zip(people, roots, strict=True) for root in several]
@@ -72,17 +71,18 @@ class VoxelLifter:
             for person, several, k in zip(people, candidates, chosen, strict=True)
         ]
         at = {i: several[k] for i, (several, k) in enumerate(zip(roots, chosen, strict=True)) if k is not None}
-        again = {i: root for i in at if (root := self._again(out[i], at[i])) is not None}
+        again = self._again(out, at)
         second = self._lift(frame, cloud, floor, [(people[i], root) for i, root in again.items()], mirrored=True)
         for i, look in zip(again, second, strict=True):
             out[i] = pooled(out[i], look)
         return out
 
-    def _again(self, person: Person, root: Root) -> Root | None:
-        """From where to look at somebody again who was looked at from `root`; None where once is enough."""
-        trunk = person.keypoints[TORSO].mean(0)
-        doubtful = person.confidence.mean() < self.doubtful and root.evidence == "depth"
-        return replace(root, point=trunk) if doubtful and trunk[2] > _NEAREST else None
+    def _again(self, people: Sequence[Person], roots: Mapping[int, Root]) -> dict[int, Root]:
+        """Who is looked at again, and from where. roots: from where they were looked at, by their number."""
+        trunks = {i: people[i].keypoints[TORSO].mean(0) for i, root in roots.items() if root.evidence == "depth"}
+        can = [i for i, trunk in trunks.items() if trunk[2] > _NEAREST]
+        least_sure = sorted(can, key=lambda i: float(people[i].confidence.mean()))[: self.second_looks]
+        return {i: replace(roots[i], point=trunks[i]) for i in sorted(least_sure)}
 
     def _lift(
         self,
