@@ -130,7 +130,7 @@ def test_pooled_looks_are_weighted_by_their_certainty():
     one = pooled(a, b)
     np.testing.assert_allclose(one.keypoints[:, 2], 2.0 * 0.8 + 2.3 * 0.2)
     np.testing.assert_allclose(one.confidence, 0.9 * 0.8 + 0.6 * 0.2)
-    np.testing.assert_allclose(one.sigma_m, 0.05 * 0.8 + 0.1 * 0.2)
+    np.testing.assert_allclose(one.sigma_m, 0.95 * (0.05 * 0.8 + 0.1 * 0.2))  # two looks err less than one
     assert one.source == a.source and one.keypoints_2d is a.keypoints_2d
 
 
