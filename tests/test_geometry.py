@@ -3,7 +3,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from understudy.geometry import angle_between, inverse, is_rigid, rigid, transform_points
+from understudy.geometry import along, angle_between, inverse, is_rigid, rigid, transform_points
 
 vectors = st.tuples(*[st.floats(-3, 3)] * 3).map(np.array)
 
@@ -28,3 +28,11 @@ def test_angle_is_the_rotation_between(axis, angle):
     across = np.cross(axis, (1.0, 0.3, 0))
     turned = Rotation.from_rotvec(angle * axis / np.linalg.norm(axis)).apply(across)
     np.testing.assert_allclose(angle_between(across, turned), angle, atol=1e-7)
+
+
+@given(st.integers(0, 2**32 - 1), st.sampled_from([(), (1,), (5,), (4, 7)]), st.integers(1, 6))
+def test_along_is_the_dot_product_with_every_direction(seed, shape, k):
+    rng = np.random.default_rng(seed)
+    points, directions = rng.normal(size=(*shape, 3)), rng.normal(size=(k, 3))
+    np.testing.assert_allclose(along(points, directions), points @ directions.T, atol=1e-12)
+    assert along(points.astype(np.float32), directions.astype(np.float32)).dtype == np.float32
