@@ -3,7 +3,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from understudy.geometry import along, angle_between, inverse, is_rigid, rigid, transform_points
+from understudy.geometry import along, angle_between, inverse, is_rigid, plane_normal, rigid, transform_points
 
 vectors = st.tuples(*[st.floats(-3, 3)] * 3).map(np.array)
 
@@ -36,3 +36,12 @@ def test_along_is_the_dot_product_with_every_direction(seed, shape, k):
     points, directions = rng.normal(size=(*shape, 3)), rng.normal(size=(k, 3))
     np.testing.assert_allclose(along(points, directions), points @ directions.T, atol=1e-12)
     assert along(points.astype(np.float32), directions.astype(np.float32)).dtype == np.float32
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(3, 40))
+def test_plane_normal_is_that_of_the_singular_vectors(seed, n):
+    rng = np.random.default_rng(seed)
+    points = rng.normal(size=(n, 3)) * (2.0, 1.0, 0.05) @ Rotation.random(random_state=seed % 2**31).as_matrix() + 3
+    normal = plane_normal(points)
+    expected = np.linalg.svd(points - points.mean(0), full_matrices=False)[2][2]
+    np.testing.assert_allclose(normal * np.sign(normal @ expected), expected, atol=1e-5)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Float32
 
-from understudy.geometry import along, rigid
+from understudy.geometry import along, plane_normal, rigid
 from understudy.types import Person
 
 CAMERA_UP = np.array([0.0, -1.0, 0.0])
@@ -83,11 +83,9 @@ def measured_floor(points: Float32[np.ndarray, "n 3"]) -> Floor | None:
         return None
     k = np.argmax(on)
     best = points[np.abs(along(points, normals[k : k + 1])[:, 0] - heights[k]) < THICKNESS_M]
-    centre = best.mean(axis=0)
-    off = (best - centre).T
-    up = np.linalg.eigh((off[:, None] * off).sum(axis=2))[1][:, 0]
+    up = plane_normal(best)
     up *= np.sign(up @ CAMERA_UP) or 1.0
-    return Floor(up, float(up @ centre))
+    return Floor(up, float(up @ best.mean(axis=0)))
 
 
 def _floor_share(

@@ -43,6 +43,13 @@ def angle_between(a: Float[np.ndarray, "*n 3"], b: Float[np.ndarray, "*n 3"]) ->
     return np.asarray(np.arctan2(cross, np.sum(a * b, axis=-1)))
 
 
+def plane_normal(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3"]:
+    """Unit normal, either way, of the plane that points lie on best (least squares); for hot paths, see `along`."""
+    away = (points - points.mean(axis=0)).T
+    normal: np.ndarray = np.linalg.eigh((away[:, None] * away).sum(axis=2))[1][:, 0]
+    return normal
+
+
 def along(points: Float[np.ndarray, "*n 3"], directions: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "*n k"]:
     """How far each point is along each direction (dot products), for hot paths.
 

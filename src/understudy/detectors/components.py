@@ -16,7 +16,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from understudy.camera import Camera
-from understudy.geometry import along
+from understudy.geometry import along, plane_normal
 from understudy.types import RegisteredDepth
 
 GRID_WIDTH = 160
@@ -209,11 +209,9 @@ def fit_floor(
     if support[best] < 0.2:
         return None
     inliers = upward[on[:, best]]
-    center = inliers.mean(0)
-    apart = (inliers - center).T
-    refined = np.linalg.eigh((apart[:, None] * apart).sum(axis=2))[1][:, 0]
+    refined = plane_normal(inliers)
     refined *= -np.sign(refined[1])
-    return np.append(refined, -refined @ center)
+    return np.append(refined, -refined @ inliers.mean(0))
 
 
 def _faces_up(points: np.ndarray, measured: np.ndarray, step: int = 2) -> np.ndarray:
