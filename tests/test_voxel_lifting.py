@@ -98,6 +98,8 @@ def test_people_are_looked_at_again_from_their_trunk(scene, monkeypatch):
     one = VoxelLifter(second_looks=1).lift(frame, seen)
     np.testing.assert_array_equal(one[1 - less_sure].keypoints, first[1 - less_sure].keypoints)
     np.testing.assert_allclose(one[less_sure].keypoints, both[less_sure].keypoints, atol=1e-4)
+    nobody = VoxelLifter(second_looks=0).lift(frame, seen)
+    assert all((a.keypoints == b.keypoints).all() for a, b in zip(first, nobody, strict=True))
 
 
 def test_a_mirrored_look_is_a_look_at_the_mirror_image(scene):

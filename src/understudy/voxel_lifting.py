@@ -30,7 +30,7 @@ from understudy.voxels import PersonView
 SECOND_LOOKS: Final = 2
 """People of a frame who are looked at again; a bound, so that crowds take no longer than they must."""
 
-_LESS = 0.95  # how far two pooled looks are off, where one is off by 1
+_POOLED_ERROR = 0.95  # of two pooled looks, where that of one is 1
 _CROWDING = 1.0  # log odds that a place loses because somebody stands there already
 _CROWDED = 0.25  # metres: trunks of two people are hardly ever as near as that
 _NEAREST = 0.2  # metres before the camera: from there on a trunk is looked at
@@ -128,7 +128,7 @@ def pooled(first: Person, second: Person) -> Person:
     sigma, confidence = (
         (weight * np.stack([getattr(look, name) for look in looks])).sum(0) for name in ("sigma_m", "confidence")
     )
-    return replace(first, keypoints=joints, sigma_m=_LESS * sigma, confidence=confidence)
+    return replace(first, keypoints=joints, sigma_m=_POOLED_ERROR * sigma, confidence=confidence)
 
 
 def choose(candidates: Sequence[Sequence[Person]], roots: Sequence[Sequence[Root]]) -> list[int | None]:

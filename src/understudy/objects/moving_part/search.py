@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.ndimage import median_filter
 from scipy.spatial import cKDTree
 
-from understudy.geometry import rigid
+from understudy.geometry import plane_normal, rigid
 from understudy.objects.articulation import PRISMATIC, REVOLUTE, Articulation
 from understudy.objects.moving_part.scoring import HIDDEN, PartModel, Scorer, motions, point_scores
 from understudy.objects.moving_part.stack import Reference
@@ -156,8 +156,7 @@ def _wider(ref: Reference, usable: Bool[np.ndarray, "h w"], at: np.ndarray, plan
 
 def fit_plane(points: Float[np.ndarray, "n 3"]) -> Plane:
     """Least squares."""
-    center = points.mean(0)
-    return np.linalg.eigh(np.cov((points - center).T))[1][:, 0], center
+    return plane_normal(points), points.mean(0)
 
 
 def hypotheses(panel: Panel) -> Iterator[tuple[str, Articulation]]:
