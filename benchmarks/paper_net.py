@@ -112,7 +112,7 @@ def openvino_run(net: PaperNet, x: np.ndarray) -> tuple[Callable[[], object], fl
 
 def default_run() -> Callable[[], object]:
     """The shipped network on one person, through the runtime that users have."""
-    network = runtime.load(weights_path(), threads=THREADS, outputs=("joints", "spread", "head"))
+    network = runtime.load_rows(weights_path(), threads=THREADS, outputs=("joints", "spread", "head"))
     rng = np.random.default_rng(0)
     depth = rng.uniform(-1.2, 1.2, (1, 2, 64, 64)).astype(np.float32)
     keypoints = rng.uniform(-0.8, 0.8, (1, 18, 3)).astype(np.float32)

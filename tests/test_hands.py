@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from understudy import recordings
+from understudy import recordings, runtime
 from understudy.camera import Camera
 from understudy.errors import ModelFileError, UnderstudyError
 from understudy.estimator import Estimator
@@ -314,13 +314,16 @@ def test_exported_network_says_what_torch_says() -> None:
 
 
 @pytest.mark.parametrize("n", [1, 2, 3])
-def test_hands_do_not_depend_on_the_number_of_threads(n: int) -> None:
+def test_hands_do_not_depend_on_the_number_of_threads(n: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    several = HandPredictor()
+    monkeypatch.setenv(runtime.THREADS, "1")
+    single = HandPredictor()
     rng = np.random.default_rng(n)
     view = HandView.of(skeleton(), "right")
     depth = np.stack([view.depth_crop(cloud_around(view, seed=k)) for k in range(n)])
     color = rng.normal(0, 0.5, (n, 9)).astype(np.float32)
     image = rng.integers(0, 256, (n, PIXELS, PIXELS, 3), dtype=np.uint8)
-    for one, two in zip(*(HandPredictor(threads=t)([view] * n, depth, color, image) for t in (1, 2)), strict=True):
+    for one, two in zip(*(ask([view] * n, depth, color, image) for ask in (single, several)), strict=True):
         for a, b in zip(astuple(one), astuple(two), strict=True):
             np.testing.assert_array_equal(a, b)
 

@@ -97,6 +97,64 @@ def test_many_threads_get_the_same_bits(ir, streams):
         assert all((alone[i] == y).all() for i, y in together)
 
 
+@pytest.fixture(scope="module")
+def open_rows(tmp_path_factory) -> Path:
+    """A network for any number of rows: each volume convolved, times a number of its own."""
+    ov, _ = runtime._openvino()
+    ops = ov.opset13
+    volumes = ops.parameter([-1, CHANNELS, SIZE, SIZE, SIZE], np.float32, name="volume")
+    scale = ops.parameter([-1, 1, 1, 1, 1], np.float32, name="scale")
+    product = ops.multiply(ops.convolution(volumes, ops.constant(KERNELS), [1] * 3, [1] * 3, [1] * 3, [1] * 3), scale)
+    outputs = [product, ops.reduce_sum(volumes, [1, 2, 3, 4])]
+    for node, name in zip([volumes, scale, *outputs], ["volume", "scale", "convolved", "sum"], strict=True):
+        node.output(0).set_names({name})
+    path = tmp_path_factory.mktemp("rows") / "rows.xml"
+    ov.save_model(ov.Model(outputs, [volumes, scale]), path, compress_to_fp16=False)
+    return path
+
+
+@pytest.mark.parametrize("limit", ["1", "2", ""])
+@pytest.mark.parametrize("same_bits", [False, True])
+def test_rows_are_computed_each_on_its_own(open_rows, monkeypatch, limit, same_bits):
+    monkeypatch.setenv(runtime.THREADS, limit)
+    whole, by_row = load(open_rows), runtime.load_rows(open_rows, same_bits=same_bits)
+    assert (by_row.inputs, by_row.outputs) == (whole.inputs, whole.outputs) == (("volume", "scale"), whole.outputs)
+    x = np.concatenate([volume(seed) for seed in range(7)])
+    scale = np.arange(1, 8, dtype=np.float32).reshape(7, 1, 1, 1, 1)
+    for n in (1, 2, 3, 7):
+        given = {"volume": x[:n], "scale": scale[:n]}
+        for got, expected in zip(by_row(**given), whole(**given), strict=True):
+            assert got.shape == expected.shape
+            np.testing.assert_allclose(got, expected, rtol=1e-5, atol=1e-4 * np.abs(expected).max())
+    two, seven = by_row(volume=x[:2], scale=scale[:2]), by_row(volume=x, scale=scale)
+    for got, expected in zip(two, seven, strict=True):
+        np.testing.assert_array_equal(got, expected[:2])
+
+
+def test_rows_in_many_threads(open_rows):
+    network = runtime.load_rows(open_rows)
+    one = np.ones((1, 1, 1, 1, 1), np.float32)
+    inputs = [(np.repeat(volume(seed), n, axis=0), np.repeat(one, n, axis=0)) for seed, n in enumerate((1, 2, 3, 4))]
+    alone = [network(volume=v, scale=s)[0] for v, s in inputs]
+    with ThreadPoolExecutor(6) as pool:
+        chosen = [0, 1, 2, 3] * 10
+        together = pool.map(lambda i: network(volume=inputs[i][0], scale=inputs[i][1])[0], chosen)
+        for i, y in zip(chosen, together, strict=True):
+            np.testing.assert_array_equal(y, alone[i])
+
+
+def test_rows_must_be_as_many_in_every_input(open_rows):
+    network = runtime.load_rows(open_rows)
+    ones = np.ones((2, 1, 1, 1, 1), np.float32)
+    for given in (
+        {"volume": volume(0)},
+        {"volume": volume(0), "scale": ones},
+        {"volume": volume(0)[:0], "scale": ones[:0]},
+    ):
+        with pytest.raises(TypeError, match=r"the network takes \('volume', 'scale'\), each with as many rows"):
+            network(**given)
+
+
 def test_threads_can_be_limited_from_outside(ir, network, monkeypatch):
     available = runtime.processors()
     monkeypatch.setenv(runtime.THREADS, "1")

@@ -18,7 +18,6 @@ from understudy.hands.crop import GREY, PIXELS, HandView
 
 WEIGHTS: Final = "handnormalnet.onnx"
 _OUTPUTS = ("normal", "direction", "log_kappa", "landmarks", "sure")
-_LEAST_ROWS = 2  # hands: of one alone, OpenVINO shares sums among the threads, whose number the last bits then show
 _LEAST_SPREAD = 0.01  # radians
 _DISAGREE = 0.8  # radians: predictions that differ by so much are hardly evidence for each other
 
@@ -47,8 +46,8 @@ def weights_path() -> Path:
 class HandPredictor:
     """The exported network. Stateless; may be called from several threads."""
 
-    def __init__(self, weights: Path | None = None, threads: int | None = None):
-        self.network = runtime.load(weights or weights_path(), threads=threads, outputs=_OUTPUTS)
+    def __init__(self, weights: Path | None = None):
+        self.network = runtime.load_rows(weights or weights_path(), outputs=_OUTPUTS, same_bits=True)
 
     def __call__(
         self,
@@ -71,8 +70,6 @@ class HandPredictor:
         given = {
             "depth": depth, "context": context, "distance": distance, "color": color, "sigma": sigma, "image": picture
         }  # fmt: skip
-        if len(views) < _LEAST_ROWS:
-            given = {name: np.repeat(rows, _LEAST_ROWS, axis=0) for name, rows in given.items()}
         normal, direction, kappa, landmarks, sure = (part.astype(np.float64) for part in self.network(**given))
         normal, direction = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in (normal, direction))
         return [

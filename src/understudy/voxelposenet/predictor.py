@@ -49,7 +49,8 @@ class Predictor:
     """The exported network. Stateless; may be called from several threads."""
 
     def __init__(self, weights: Path | None = None, threads: int | None = None):
-        self.network = runtime.load(weights or weights_path(), threads=threads, outputs=("joints", "spread", "head"))
+        outputs = ("joints", "spread", "head")
+        self.network = runtime.load_rows(weights or weights_path(), threads=threads, outputs=outputs)
 
     def __call__(
         self,
