@@ -5,7 +5,7 @@ import pytest
 
 from understudy.camera import Camera
 from understudy.detectors.components import DepthGrid, fit_floor
-from understudy.detectors.windows import Scene, tiles, windows
+from understudy.detectors.windows import Scene, tiled, windows
 from understudy.types import RegisteredDepth
 
 PITCH, HEIGHT = 0.2, 1.3  # radians downwards, metres above the floor
@@ -81,7 +81,7 @@ def test_a_table_is_not_a_floor_when_the_floor_is_seen(camera: Camera):
 def test_hidden_people_are_greyed_out_and_only_they(camera: Camera):
     scene = Scene(RegisteredDepth(room(camera, [(-0.6, 3.0), (0.6, 3.0)]), camera), camera)
     a, b = (i for i, g in enumerate(scene.groups) if g.compact)
-    look = next(w for w in windows(960, 540, scene) if w.group is None)  # the whole image
+    look = tiled(960, 540)[0]  # the whole image
     crop = np.full((224, 224, 3), 200, np.uint8)
     hidden = scene.hide(crop, look.region, scene.hidden(a))
     A = np.vstack([look.region.to_image(224), (0, 0, 1)])
@@ -109,8 +109,8 @@ def test_cells_and_colour_pixels_agree(camera: Camera):
 def test_tiles_cover_the_image():
     for width, height in ((960, 540), (640, 480), (540, 960), (300, 300)):
         covered = np.zeros((height, width), bool)
-        for tile in tiles(width, height, (1.0, 0.67))[1:] or tiles(width, height, (1.0,)):
-            x, y, half = *tile.center, tile.size / 2
+        for tile in [*tiled(width, height)[1:], *windows(width, height, None)]:
+            x, y, half = *tile.region.center, tile.region.size / 2
             covered[max(0, round(y - half)) : round(y + half) + 1, max(0, round(x - half)) : round(x + half) + 1] = True
         assert covered.all()
 
@@ -127,4 +127,4 @@ def test_cells_without_a_ray_do_no_harm(camera: Camera):
 
 
 def test_tiles_of_thin_images_stay_few():
-    assert len(tiles(2, 2000, (1.0, 0.67))) < 60
+    assert len(tiled(2, 2000)) + len(windows(2, 2000, None)) < 60

@@ -6,6 +6,7 @@ same mirrored) -> agreement of the looks and of the depth under them -> people.
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,7 +14,7 @@ from jaxtyping import Float, UInt8
 
 from understudy.assets import model_path
 from understudy.detectors.blazepose_nets import DETECTOR_SIZE, LANDMARK_SIZE, BlazePoseNets, Landmarks, Region
-from understudy.detectors.windows import Scene, windows
+from understudy.detectors.windows import Scene, Window, tiled, windows
 from understudy.skeleton import BONES, FACE, JOINT, N_JOINTS, TORSO, to_coco18
 from understudy.types import Keypoints2D, RegisteredDepth
 
@@ -85,18 +86,24 @@ class BlazePoseDetector:
         """min_score: least probability that a region holds a person. threads: networks that run at a time."""
         self.min_score = min_score
         self._nets = BlazePoseNets(model_path("pose_detection"), model_path("pose_landmark_full"), threads)
+        self._pool = ThreadPoolExecutor(threads, thread_name_prefix="blazepose")
 
     def detect(
         self, color: UInt8[np.ndarray, "h w 3"], depth: RegisteredDepth | None = None, index: int = 0
     ) -> list[Keypoints2D]:
         """People in an RGB image (see `Detector.detect`)."""
-        scene = self._scene(color, depth)
-        candidates = distinct(self._candidates(color, scene))
-        looks = self._looks(color, scene, candidates)
         height, width = color.shape[:2]
+        looks = tiled(width, height)
+        found = [self._pool.submit(self._found_in, look, color, None) for look in looks]
+        scene = self._scene(color, depth)  # while the networks look at the tiles
+        special = windows(width, height, scene)
+        found += [self._pool.submit(self._found_in, look, color, scene) for look in special]
+        rows = [each.result() for each in found]
+        candidates = distinct(_candidates(scene, looks + special, rows))
+        looks_at = self._pool.map(lambda candidate: self._three_looks(color, scene, candidate), candidates)
         people = [
             self._fuse(scene, candidate, [_coco(look, width, height) for look in three])
-            for candidate, three in zip(candidates, looks, strict=True)
+            for candidate, three in zip(candidates, looks_at, strict=True)
             if max(look.score for look in three) >= self.min_score
         ]
         return merge_duplicates([p for p in people if scene is None or p.life_size(scene)])
@@ -108,56 +115,33 @@ class BlazePoseDetector:
         height, width = color.shape[:2]
         return Scene(depth, depth.camera.resize(width, height))
 
-    def _candidates(self, color: np.ndarray, scene: Scene | None) -> list[Candidate]:
-        """Everybody whom the detection network sees in some window; the same person many times."""
-        looks = windows(color.shape[1], color.shape[0], scene)
-        crops = []
-        for look in looks:
-            crop = look.region.crop(color, DETECTOR_SIZE)
-            if scene is not None and look.group is not None:
-                crop = scene.hide(crop, look.region, scene.hidden(look.group))
-            crops.append(crop)
-        out = []
-        for look, rows in zip(looks, self._nets.detect(crops), strict=True):
-            A = look.region.to_image(DETECTOR_SIZE)
-            for row in rows:
-                hip, rim, shoulder, _ = row[1:].reshape(4, 2) @ A[:, :2].T + A[:, 2]
-                torso = float(np.linalg.norm(hip - shoulder))
-                group = -1 if scene is None else _group_between(scene, hip, shoulder)
-                if look.group is not None and group not in (-1, look.group):
-                    continue  # somebody else, whose own window shows them better
-                region, own = Region.from_points(hip, rim), look.group is not None
-                out.append(Candidate(float(row[0]), region, hip, torso, group, own))
-        return out
+    def _found_in(self, look: Window, color: np.ndarray, scene: Scene | None) -> Float[np.ndarray, "n 9"]:
+        """Rows of everybody whom the detection network sees in one window (see `BlazePoseNets.detect`)."""
+        crop = look.region.crop(color, DETECTOR_SIZE)
+        if scene is not None and look.group is not None:
+            crop = scene.hide(crop, look.region, scene.hidden(look.group))
+        return self._nets.detect(crop)
 
-    def _looks(
-        self, color: np.ndarray, scene: Scene | None, candidates: list[Candidate]
-    ) -> list[tuple[Landmarks, Landmarks, Landmarks]]:
-        """Three looks at each candidate: as seen; again from a better region, with other people hidden where depth
-        tells them apart; and once more from a still better region, mirrored.
+    def _three_looks(
+        self, color: np.ndarray, scene: Scene | None, candidate: Candidate
+    ) -> tuple[Landmarks, Landmarks, Landmarks]:
+        """As seen; again from a better region, with other people hidden where depth tells them apart; and once more
+        from a still better region, mirrored.
         """
-        regions = [c.region for c in candidates]
-        plain = self._nets.landmarks([r.crop(color, LANDMARK_SIZE) for r in regions], regions)
-        hidden = [scene.hidden(c.group) if scene is not None and c.group >= 0 else None for c in candidates]
-        # under an overlap the first look may have followed the other person: keep the detector's region there
-        overlap = [
-            scene is not None and h is not None and scene.shows(c.region, h)
-            for c, h in zip(candidates, hidden, strict=True)
-        ]
-        regions = [c.region if o else look.next_region for c, o, look in zip(candidates, overlap, plain, strict=True)]
-        checked = self._nets.landmarks(self._masked(color, scene, regions, hidden), regions)
-        regions = [look.next_region for look in checked]
-        mirrored = self._nets.landmarks(self._masked(color, scene, regions, hidden), regions, mirrored=True)
-        return list(zip(plain, checked, mirrored, strict=True))
+        region = candidate.region
+        hidden = scene.hidden(candidate.group) if scene is not None and candidate.group >= 0 else None
 
-    @staticmethod
-    def _masked(
-        color: np.ndarray, scene: Scene | None, regions: list[Region], hidden: list[np.ndarray | None]
-    ) -> list[np.ndarray]:
-        crops = [r.crop(color, LANDMARK_SIZE) for r in regions]
-        if scene is None:
-            return crops
-        return [c if h is None else scene.hide(c, r, h) for c, r, h in zip(crops, regions, hidden, strict=True)]
+        def masked(region: Region) -> np.ndarray:
+            crop = region.crop(color, LANDMARK_SIZE)
+            return crop if scene is None or hidden is None else scene.hide(crop, region, hidden)
+
+        plain = self._nets.landmarks(region.crop(color, LANDMARK_SIZE), region)
+        # under an overlap the first look may have followed the other person: keep the detector's region there
+        if scene is None or hidden is None or not scene.shows(region, hidden):
+            region = plain.next_region
+        checked = self._nets.landmarks(masked(region), region)
+        region = checked.next_region
+        return plain, checked, self._nets.landmarks(masked(region), region, mirrored=True)
 
     @staticmethod
     def _fuse(scene: Scene | None, candidate: Candidate, looks: list[Float[np.ndarray, "18 3"]]) -> Sighting:
@@ -179,6 +163,22 @@ class BlazePoseDetector:
         rows[JOINT["neck"], :2] = rows[_SHOULDERS, :2].mean(0)
         rows[JOINT["neck"], 2] = rows[_SHOULDERS, 2].min()
         return Sighting(Keypoints2D.where(rows[:, :2], rows[:, 2], torso_z), torso, candidate.group)
+
+
+def _candidates(scene: Scene | None, looks: list[Window], found: list[Float[np.ndarray, "_ 9"]]) -> list[Candidate]:
+    """Everybody whom the detection network saw in some window; the same person many times. found: in each."""
+    out = []
+    for look, rows in zip(looks, found, strict=True):
+        A = look.region.to_image(DETECTOR_SIZE)
+        for row in rows:
+            hip, rim, shoulder, _ = row[1:].reshape(4, 2) @ A[:, :2].T + A[:, 2]
+            torso = float(np.linalg.norm(hip - shoulder))
+            group = -1 if scene is None else _group_between(scene, hip, shoulder)
+            if look.group is not None and group not in (-1, look.group):
+                continue  # somebody else, whose own window shows them better
+            region, own = Region.from_points(hip, rim), look.group is not None
+            out.append(Candidate(float(row[0]), region, hip, torso, group, own))
+    return out
 
 
 def _torso_length(rows: np.ndarray) -> float:

@@ -7,7 +7,6 @@ non-maximum suppression, a rotated square region from two keypoints, heatmap ref
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -100,23 +99,19 @@ def sigmoid(x: np.ndarray) -> np.ndarray:
 
 
 class BlazePoseNets:
-    """Runs the networks, several crops at a time."""
+    """Runs the networks. Calls from several threads are computed at the same time, one a thread."""
 
     def __init__(self, detector: Path, landmarks: Path, threads: int = 2):
         # one crop a thread: as fast as batches, or as all threads on one crop, and faster where other programs run
         self._detector = load(detector, threads=threads, streams=threads, outputs=("Identity", "Identity_1"))
         wanted = ("Identity", "Identity_1", "Identity_3")  # not: a mask of the person, positions in metres
         self._landmarker = load(landmarks, threads=threads, streams=threads, outputs=wanted)
-        self._pool = ThreadPoolExecutor(threads, thread_name_prefix="blazepose")
 
-    def detect(self, crops: list[UInt8[np.ndarray, "224 224 3"]]) -> list[Float[np.ndarray, "n 9"]]:
-        """Person candidates in each crop: rows (score, then x, y of mid hip, hip circle, mid shoulder, upper circle).
+    def detect(self, crop: UInt8[np.ndarray, "224 224 3"]) -> Float[np.ndarray, "n 9"]:
+        """Person candidates in a crop: rows (score, then x, y of mid hip, hip circle, mid shoulder, upper circle).
 
         Coordinates are pixels of the crop.
         """
-        return list(self._pool.map(self._detect, crops))
-
-    def _detect(self, crop: np.ndarray) -> np.ndarray:
         boxes, logits = self._detector(crop[None].astype(np.float32) / 127.5 - 1)
         score = sigmoid(logits[0, :, 0])
         keep = np.flatnonzero(score > 0.5)
@@ -126,17 +121,12 @@ class BlazePoseNets:
         keypoints = raw[:, 4:12].reshape(-1, 4, 2) + anchors[:, None]
         return weighted_suppression(score[keep], corners, keypoints * DETECTOR_SIZE - 0.5)
 
-    def landmarks(
-        self, crops: list[UInt8[np.ndarray, "256 256 3"]], regions: list[Region], mirrored: bool = False
-    ) -> list[Landmarks]:
-        """Landmarks of the person in each crop, in image pixels.
+    def landmarks(self, crop: UInt8[np.ndarray, "256 256 3"], region: Region, mirrored: bool = False) -> Landmarks:
+        """Landmarks of the person in a crop, in image pixels.
 
-        regions: the part of the image that each crop shows. mirrored: let the network look at the mirror images; the
-        results are mirrored back and left and right exchanged, so that they compare with the plain ones.
+        region: the part of the image that the crop shows. mirrored: let the network look at the mirror image; the
+        result is mirrored back and left and right exchanged, so that it compares with a plain one.
         """
-        return list(self._pool.map(lambda crop, region: self._landmarks(crop, region, mirrored), crops, regions))
-
-    def _landmarks(self, crop: np.ndarray, region: Region, mirrored: bool) -> Landmarks:
         image = crop[:, ::-1] if mirrored else crop
         raw, score, heatmaps = self._landmarker(image[None].astype(np.float32) / 255)
         rows = raw.reshape(-1, 5).astype(np.float64)

@@ -102,12 +102,17 @@ class Scene:
         return (crop + grey).astype(np.uint8)
 
 
+def tiled(width: int, height: int) -> list[Window]:
+    """Where to look in any image of width x height: all of it, and in squares as large as its shorter side."""
+    return [Window(_around((-0.5, -0.5, width - 0.5, height - 0.5), 1.0), None), *_tiles(width, height, 1.0)]
+
+
 def windows(width: int, height: int, scene: Scene | None) -> list[Window]:
-    """Where to look in an image of width x height."""
+    """Where to look besides: where depth shows things, or, without depth, in smaller squares."""
     if scene is None:
-        return [Window(r, None) for r in tiles(width, height, (1.0, 0.67))]
+        return _tiles(width, height, 0.67)
     found = [Window(_completed(g, width, height, scene), i) for i, g in enumerate(scene.groups) if g.compact]
-    return found + [Window(r, None) for r in tiles(width, height, (1.0,)) + _joined(width, height, scene)]
+    return found + [Window(r, None) for r in _joined(width, height, scene)]
 
 
 def _completed(group: Group, width: int, height: int, scene: Scene) -> Region:
@@ -135,13 +140,10 @@ def _joined(width: int, height: int, scene: Scene) -> list[Region]:
     return squares[:: -(-len(squares) // MAX_JOINED)]
 
 
-def tiles(width: int, height: int, sides: tuple[float, ...]) -> list[Region]:
-    """The whole image, then overlapping squares with sides given in shorter image sides."""
-    out = [_around((-0.5, -0.5, width - 0.5, height - 0.5), 1.0)]
-    for share in sides:
-        squares = _cover(-0.5, -0.5, width - 0.5, height - 0.5, share * min(width, height))
-        out += squares if len(squares) > 1 else []
-    return out
+def _tiles(width: int, height: int, side: float) -> list[Window]:
+    """Overlapping squares with a side given in shorter image sides; none where one would do."""
+    squares = _cover(-0.5, -0.5, width - 0.5, height - 0.5, side * min(width, height))
+    return [Window(r, None) for r in squares] if len(squares) > 1 else []
 
 
 def _cover(left: float, top: float, right: float, bottom: float, side: float) -> list[Region]:
