@@ -30,6 +30,8 @@ _DEFINITIONS = f"""\
   before any method runs (least median distance of the keypoints, at most 0.3 of the person's size in the image);
   **all methods get the same detections**. Undetected people and detections of nobody are counted above the tables,
   and are nobody's fault here.
+- Held-out simulation: people 1.5 to 5 m from the camera; neither training nor validation nor calibration has these
+  bodies (`benchmark.held_out`).
 - Joints: those inside the image, visible or occluded. EPE: mean Euclidean error, cm, of the joints that a method
   gave. PCK@10: share within 10 cm. AUC: area under the PCK curve from 0 to 20 cm, over its width (0 to 1).
 - **A joint that a method does not give counts as missed in PCK and AUC, and is left out of the EPE.** `common EPE` is
