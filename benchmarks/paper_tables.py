@@ -1,7 +1,7 @@
 """The paper's tables and figures: every method on held-out simulated recordings, and on any others with truth.
 
     python benchmarks/paper_tables.py --out docs/comparison --weights RUN --mlp MLP.safetensors \\
-        --paper-fast WEIGHTS --runs "anny=RUN capsules=RUN both=RUN" --held-out "realsense=RUN" --recordings DIR...
+        --paper-fast RUN --runs "anny=RUN capsules=RUN both=RUN" --held-out "realsense=RUN" --recordings DIR...
 
 What is absent is left out, and the page says so. All that was computed stays in the cache: started again, it goes on
 where it stopped. The MLP is trained by `python -m understudy.voxelposenet.mlp`; --fit-offsets fits the offsets of
@@ -47,7 +47,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         groups.append(group(chosen.title, "further", chosen.recordings, methods, chosen.cache))
     if not groups:
         raise UnderstudyError("no recordings to compare methods on: give --recordings")
-    write_report(chosen.out, groups, trainings, notes)
+    trained = {method.name: method.trained for method in methods.values() if method.trained}
+    write_report(chosen.out, groups, trainings, notes, trained)
     say(f"wrote {chosen.out / 'README.md'}")
 
 
@@ -56,8 +57,8 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--out", type=Path, default=Path("docs/comparison"))
     parser.add_argument("--weights", type=Path, help="of the default network: .onnx, .safetensors or a run's folder")
     parser.add_argument("--mlp", type=Path)
-    parser.add_argument("--paper-fast", type=Path)
-    parser.add_argument("--paper", type=Path)
+    parser.add_argument("--paper-fast", type=Path, help="a run, or imported weights")
+    parser.add_argument("--paper", type=Path, help="the same of the larger variant")
     parser.add_argument("--runs", default="", help="runs by the body set that they were trained on: 'anny=RUN ...'")
     parser.add_argument("--held-out", default="", help="runs by the sensor that they were not shown: 'realsense=RUN'")
     parser.add_argument("--recordings", type=Path, nargs="+", default=[], help="with truth.json and keypoints2d.json")
@@ -98,8 +99,9 @@ def other_trainings(bodies: dict[str, Path], sensors: dict[str, Path]) -> tuple[
             else:
                 found[kind].append(name)
                 if (path / "config.json").is_file():
-                    run = json.loads((path / "config.json").read_text())["config"]
-                    seen[name] = run["steps"] * run["batch"]
+                    about = json.loads((path / "config.json").read_text())
+                    run = about["config"]
+                    seen[name] = run["steps"] * run["batch"] * about.get("processes", 1)
     return methods, Trainings(tuple(found["bodies"]), tuple(found["without"]), tuple(notes), seen)
 
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from understudy.benchmark import comparison_report
+from understudy.benchmark import comparison_report, methods
 from understudy.benchmark.comparison import RUN, Group, Lifted, lift_group
 from understudy.benchmark.comparison_report import PLOTS, Trainings, held_out_name, main_table, write_report
 from understudy.benchmark.methods import NAMES, NETWORK, OURS, Method, Weights, available
@@ -221,9 +222,27 @@ def test_the_page_on_trainings_stays_until_there_are_others(group, tmp_path, mon
     assert not (tmp_path / comparison_report.TRAININGS).exists()
     assert comparison_report.TRAININGS not in (tmp_path / "README.md").read_text()
     (tmp_path / comparison_report.TRAININGS).write_text("of last week")
-    write_report(tmp_path, [group], Trainings(), [])
+    write_report(tmp_path, [group], Trainings(notes=("capsules: left out",)), [], {"mlp": "5 simulated people"})
     assert (tmp_path / comparison_report.TRAININGS).read_text() == "of last week"
-    assert f"({comparison_report.TRAININGS})" in (tmp_path / "README.md").read_text()
+    page = (tmp_path / "README.md").read_text()
+    assert f"({comparison_report.TRAININGS})" in page and "- mlp: 5 simulated people" in page
+    assert "capsules: left out" not in page  # it stands in the other page
+
+
+def test_runs_of_the_papers_network_say_how_long_they_were_trained(tmp_path):
+    pytest.importorskip("torch")
+    about = {"config": {"network": "paper-fast", "batch": 2, "schedule": "steps", "decay_every": 50, "bf16": True,
+                        "learning_rate": 1e-4}, "processes": 2}  # fmt: skip
+    (tmp_path / "config.json").write_text(json.dumps(about))
+    (tmp_path / "log.csv").write_text("step,hours,loss\n50,0.5,2\n75,1.26,1\n")
+    with pytest.raises(UnderstudyError, match=r"weights\.safetensors"):
+        methods._REGISTRY["paper-fast"]("paper-fast", Weights(paper_fast=tmp_path))
+    (tmp_path / "weights.safetensors").write_bytes(b"any")
+    method = methods._REGISTRY["paper-fast"]("paper-fast", Weights(paper_fast=tmp_path))
+    assert method.trained == (
+        "75 steps of 4 simulated people, 1.3 hours on cpu in bfloat16, learning rate 0.0001, a tenth of it after every "
+        "50 steps"
+    )
 
 
 def test_missing_weights_are_noted(tmp_path):

@@ -222,6 +222,15 @@ def test_looks_that_agree_win():
     np.testing.assert_allclose(hand.keypoints_2d[:, :2], palm.uv)
 
 
+def test_two_looks_that_disagree_say_less():
+    """As many as are taken by default: neither has a majority, and the quality says so."""
+    palm, back = look_at(right_hand(), AT), look_at(right_hand() * (-1, 1, -1), AT)
+    split = ColorPath(PerfectNets([palm, back])).estimate(frame_of(BLACK), BODY)["right"]
+    agreed = ColorPath(PerfectNets([palm, palm])).estimate(frame_of(BLACK), BODY)["right"]
+    assert split.share == 0.5 and split.spread == pytest.approx(np.pi / 2**0.5) and abs(split.normal[2]) > 0.99
+    assert split.quality < agreed.quality - 0.2
+
+
 def test_looks_that_saw_something_else_do_not_count():
     palm = look_at(right_hand(), AT)
     elsewhere = look_at(right_hand(), AT + (0.3, 0, 0))

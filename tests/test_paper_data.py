@@ -149,3 +149,6 @@ def test_the_papers_network_is_trained_by_the_same_trainer(tmp_path):
     assert [p.name for p in made] == ["voxelposenet-paper-fast.safetensors", "MODEL_CARD.md"]
     with safe_open(made[0], "np") as f:
         assert f.metadata()["step"] == "2"
+    card = made[1].read_text()
+    assert "paper_grid" in card and "no calibrated uncertainty" in card
+    assert "68 %" not in card and "PersonView" not in card

@@ -30,6 +30,8 @@ _DEFINITIONS = f"""\
   before any method runs (least median distance of the keypoints, at most 0.3 of the person's size in the image);
   **all methods get the same detections**. Undetected people and detections of nobody are counted above the tables,
   and are nobody's fault here.
+- Held-out simulation: people 1.5 to 5 m from the camera; neither training nor validation nor calibration has these
+  bodies (`benchmark.held_out`).
 - Joints: those inside the image, visible or occluded. EPE: mean Euclidean error, cm, of the joints that a method
   gave. PCK@10: share within 10 cm. AUC: area under the PCK curve from 0 to 20 cm, over its width (0 to 1).
 - **A joint that a method does not give counts as missed in PCK and AUC, and is left out of the EPE.** `common EPE` is
@@ -45,9 +47,10 @@ _DEFINITIONS = f"""\
   confidence.
 - naive: 2D keypoint at the median of the 3 nearest depths. naive-offset: that, moved along the ray by a constant per
   kind of joint, fitted on the simulator. mlp: residual MLP on all 2D keypoints and the depths under them, trained on
-  the same simulated people as the network. `{NO_ASSEMBLY}`: the network's joints. `{PAPER_ASSEMBLY}`: where the 2D
-  score exceeds the confidence, the 2D keypoint at the network's depth. `{UPPER}...`: the network given the projected
-  true joints (score 1) in place of detections: the upper bound.
+  people of the same simulator (`python -m understudy.voxelposenet.mlp`). paper-fast, paper: the paper's networks, with
+  its root, grid and assembly (`understudy train --preset paper`). `{NO_ASSEMBLY}`: the network's joints.
+  `{PAPER_ASSEMBLY}`: where the 2D score exceeds the confidence, the 2D keypoint at the network's depth. `{UPPER}...`:
+  the network given the projected true joints (score 1) in place of detections: the upper bound.
 - Degraded 2D: "errors x 2" doubles each detected keypoint's distance from the true one; "20 % dropped" loses each
   found keypoint with a probability of 20 %."""
 
@@ -70,9 +73,16 @@ def held_out_name(sensor: str) -> str:
     return f"{RUN}without {sensor}"
 
 
-def write_report(out: Path, groups: Sequence[Group], trainings: Trainings, notes: Sequence[str]) -> None:
+def write_report(
+    out: Path,
+    groups: Sequence[Group],
+    trainings: Trainings,
+    notes: Sequence[str],
+    trained: Mapping[str, str] | None = None,
+) -> None:
     """README.md, the plots of every group, and trainings.md if other trainings were run.
 
+    notes: what was left out. trained: of methods, on what and how long.
     Otherwise a page on trainings that is there stays: it says itself when and with what it was made.
     """
     parts = ["# Comparison of methods", _INTRODUCTION]
@@ -81,12 +91,16 @@ def write_report(out: Path, groups: Sequence[Group], trainings: Trainings, notes
             write_atomically(out / name, png)
         parts += list(_group(group))
     ran = ["## Where it ran", environment_lines(environment())]
-    left_out = [*notes, *trainings.notes]
+    left_out = list(notes)
+    if trainings.bodies or trainings.without or not (out / TRAININGS).exists():
+        left_out += trainings.notes
     if trainings.bodies or trainings.without:
         page = ["# What the network was trained on", _TRAININGS, *_trainings(groups, trainings), *ran]
         write_atomically(out / TRAININGS, "\n\n".join(page) + "\n")
     if (out / TRAININGS).exists():
         parts.append(f"Other body sets in training, and a sensor kept out of it: [{TRAININGS}]({TRAININGS}).")
+    if trained:
+        parts += ["## How long others were trained", "\n".join(f"- {name}: {how}" for name, how in trained.items())]
     if left_out:
         parts += ["## Left out", "\n".join(f"- {n}" for n in left_out)]
     parts += ["## What the numbers mean", _DEFINITIONS, *ran]
@@ -94,6 +108,8 @@ def write_report(out: Path, groups: Sequence[Group], trainings: Trainings, notes
 
 
 TRAININGS: Final = "trainings.md"
+ALL: Final = "both"
+"""the training with both body sets, and with all sensors"""
 _TRAININGS = (
     "Written by `benchmarks/paper_tables.py` when it is given such runs; the test recordings and definitions are those "
     "of [README.md](README.md)."
@@ -292,4 +308,9 @@ def _trainings(groups: Sequence[Group], trainings: Trainings) -> Iterator[str]:
             for sensor in trainings.without
             for g in groups
         ]
-        yield markdown_lines(["sensor", "people shown", "trained without it", f"{OURS} (trained with it)"], rows)
+        heads = ["sensor", "people shown", "trained without it", f"{OURS} (shipped; trained with it)"]
+        if ALL in trainings.bodies:
+            heads.append(f"as long, trained with it ({shown(ALL)} people)")
+            for row, (sensor, g) in zip(rows, ((s, g) for s in trainings.without for g in groups), strict=True):
+                row.append(cell(g, g.rows(sensor), RUN + ALL))
+        yield markdown_lines(heads, rows)

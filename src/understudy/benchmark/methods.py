@@ -12,6 +12,7 @@ from typing import Any, Final
 import understudy
 from understudy.assets import cache_dir
 from understudy.errors import UnderstudyError
+from understudy.files import read_json
 from understudy.lifting import Lifter, NaiveLifter
 
 OURS, NO_ASSEMBLY, PAPER_ASSEMBLY = "voxelposenet", "voxelposenet, no assembly", "voxelposenet, paper's assembly"
@@ -32,6 +33,7 @@ class Weights:
     """exported (.onnx) or trained (.safetensors, or a run's folder); None: what comes with the package"""
     mlp: Path | None = None
     paper: Path | None = None
+    """also a run's folder"""
     paper_fast: Path | None = None
 
 
@@ -43,6 +45,8 @@ class Method:
     make: Callable[[], Lifter]
     key: str
     """changes when its weights or its code change"""
+    trained: str = ""
+    """on what and how long, where its weights say so"""
 
 
 def available(weights: Weights) -> tuple[dict[str, Method], list[str]]:
@@ -104,6 +108,31 @@ def _require(path: Path, how: str) -> None:
         raise UnderstudyError(f"There is no file {path}. Give it with {how}")
 
 
+def _mlp_trained(path: Path) -> str:
+    from safetensors import safe_open
+
+    with safe_open(str(path), "np") as f:
+        words = f.metadata() or {}
+    return f"{int(words['people']):,} simulated people" if "people" in words else ""
+
+
+def _run_told(run: Path) -> str:
+    """How long a run of `understudy train` took, and with what schedule; from its configuration and its log."""
+    from understudy.voxelposenet import records
+    from understudy.voxelposenet.training import CONFIG, read_config
+
+    config, log = read_config(run / CONFIG), records.read(run / records.LOG)
+    if not log:
+        return ""
+    steps, batch = int(log[-1]["step"]), config.batch * read_json(run / CONFIG).get("processes", 1)
+    precision = "bfloat16" if config.bf16 else "float32"
+    schedule = f", a tenth of it after every {config.decay_every:,} steps" if config.schedule == "steps" else ""
+    return (
+        f"{steps:,} steps of {batch} simulated people, {float(log[-1]['hours']):.1f} hours on {config.device} in "
+        f"{precision}, learning rate {config.learning_rate:g}{schedule}"
+    )
+
+
 def _naive(name: str, weights: Weights) -> Method:
     return Method(name, NaiveLifter, fingerprint(()))
 
@@ -119,7 +148,7 @@ def _mlp(name: str, weights: Weights) -> Method:
 
     path = weights.mlp or cache_dir() / "comparison" / "mlp.safetensors"
     _require(path, f"--mlp FILE, or train it: python -m understudy.voxelposenet.mlp {path}")
-    return Method(name, lambda: MlpLifter(path), fingerprint((*_VOXELS, "baselines"), path))
+    return Method(name, lambda: MlpLifter(path), fingerprint((*_VOXELS, "baselines"), path), _mlp_trained(path))
 
 
 @dataclass(frozen=True)
@@ -134,8 +163,12 @@ class _Paper:
         path = getattr(weights, self.which)
         if path is None:
             raise UnderstudyError(f"No weights were given; with {self.option} FILE it is compared")
-        _require(path, f"{self.option} FILE: the weights of `understudy train --preset` or `understudy weights import`")
-        return Method(name, lambda: PaperLifter(path), fingerprint(_PAPER, path))
+        trained = ""
+        if path.is_dir():
+            trained = _run_told(path)
+            path = path / "weights.safetensors"
+        _require(path, f"{self.option} PATH: a run of `understudy train`, or what `understudy weights import` writes")
+        return Method(name, lambda: PaperLifter(path), fingerprint(_PAPER, path), trained)
 
 
 @dataclass(frozen=True)

@@ -194,8 +194,13 @@ def from_recordings(
         hands=TrueHands.pooled([p.hands for p in parts]),
         said={m: Said.pooled([p.said[m] for p in parts]) for m in methods},
         about=f"{'; '.join(notes)}. 2D keypoints: {detector}.",
-        ms={m: median(np.array([t for p in parts for t in p.ms[m]])) for m in methods},
+        ms={m: _median_and_most(np.array([t for p in parts for t in p.ms[m]])) for m in methods},
     )
+
+
+def _median_and_most(times: Float[np.ndarray, " n"]) -> tuple[float, float]:
+    """Median and 90 %; NaN of none."""
+    return median(times), float(np.quantile(times, 0.9)) if len(times) else float("nan")
 
 
 def estimators(detector: str) -> Callable[[Recording], People]:

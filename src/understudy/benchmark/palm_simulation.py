@@ -24,7 +24,7 @@ from understudy.benchmark.palms import ALL_GIVEN, BOTH, DEPTH, POSTURE, WORD, Sa
 
 BODIES, HANDS, BANK_SEED, SEED = 60, 40, 2001, 4242
 """The simulated hands: different bodies and hands, the seed of both banks, and that of everything else. Training has
-the seeds 1 and 0, its validation 1001 and 900."""
+bank seed 1 and other seeds, its validation 1001 and 900."""
 
 _BATCH = 64  # simulated hands at a time
 _ASKED = 512  # hands that the network is asked at a time
@@ -131,7 +131,9 @@ def from_simulation(simulated: SimulatedHands, network: HandNetwork) -> Source:
         f"{n} hands in view of simulated people, hands and scenes that neither training nor validation has seen "
         f"({BODIES} bodies, {HANDS} different hands), as they are put to the exported network: depth crops with a "
         "sensor's errors, colour crops, joints with an estimate's errors, and, where the first look is unsure, words "
-        "of the colour path with its measured errors."
+        "of the colour path with its measured errors (drawn by a model, `synthetic.hand_color`). A second look is in "
+        "the same place; the estimator also moves it to where it found the wrist. The colour network alone is compared "
+        "on recordings only: here is no whole image for it to look at."
     )
     return Source("Simulated hands in detail", "simulated", (), True, simulated.hands, said, about, {})
 
@@ -141,7 +143,7 @@ def _joined(first: Said, second: Said, again: Bool[np.ndarray, " n"]) -> Said:
     normal, confidence = first.normal.copy(), first.confidence.copy()
     for i in np.flatnonzero(again):
         looks = [
-            HandPrediction(said.normal[i], said.normal[i], np.zeros((21, 3)), np.ones(2), float(said.confidence[i]))
+            HandPrediction(said.normal[i], said.normal[i], np.zeros((21, 3)), float(said.confidence[i]))
             for said in (first, second)
         ]
         both = pooled(looks)
@@ -159,7 +161,7 @@ def _ask(
     parts = []
     for start in range(0, len(depth), _ASKED):
         rows = slice(start, start + _ASKED)
-        normal, _, _, _, sure = network(
+        normal, _, _, sure = network(
             depth=depth[rows],
             context=hands.context[rows],
             distance=hands.distance[rows],

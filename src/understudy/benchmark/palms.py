@@ -23,7 +23,7 @@ CHECKED: Final = "colour, with checks"
 LIFTED: Final = "colour landmarks on the depth"
 PAPER: Final = "colour network alone (the paper's way)"
 WORD: Final = "simulated colour word alone"
-MAIN: Final = (ALL_GIVEN, DEPTH)
+MAIN: Final = (BOTH, ALL_GIVEN, DEPTH)
 """Methods of the tables by kind of hand."""
 
 HAND_M: Final = 0.19
@@ -89,8 +89,8 @@ class Source:
     said: Mapping[str, Said]
     about: str
     """where the hands come from, a sentence or two"""
-    ms: Mapping[str, float]
-    """method -> milliseconds for both hands of one person (median); where it was measured"""
+    ms: Mapping[str, tuple[float, float]]
+    """method -> milliseconds for both hands of one person, median and 90 %; where it was measured"""
 
     def errors(self, method: str) -> Float[np.ndarray, " n"]:
         """Radians; NaN where not given."""

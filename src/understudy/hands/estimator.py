@@ -209,8 +209,8 @@ class _Hand:
     def palm(self, camera: Camera, word: HandPrediction, crop: DepthCrop) -> Palm:
         """The result, from the pooled prediction. crop: of the first look."""
         projected = np.nan_to_num(camera.project(word.landmarks))
-        score = np.where(camera.contains(projected), _PROJECTED_SCORE * word.confidence, 0.0)
-        keypoints_2d = np.column_stack([projected, score])
+        inside = camera.contains(projected)[:, None]
+        keypoints_2d = np.where(inside, np.insert(projected, 2, _PROJECTED_SCORE * word.confidence, axis=1), 0.0)
         if self.color is not None and np.arccos(np.clip(self.color.normal @ word.normal, -1, 1)) < _AGREE:
             keypoints_2d = self.color.keypoints_2d
         there = supported(self.view, crop, word.landmarks)

@@ -17,7 +17,7 @@ from understudy.hands.color_path import ColorPalm
 from understudy.hands.crop import GREY, PIXELS, HandView
 
 WEIGHTS: Final = "handnormalnet.onnx"
-_OUTPUTS = ("normal", "direction", "log_kappa", "landmarks", "sure")
+_OUTPUTS = ("normal", "direction", "landmarks", "sure")
 _LEAST_SPREAD = 0.01  # radians
 _DISAGREE = 0.8  # radians: predictions that differ by so much are hardly evidence for each other
 
@@ -32,8 +32,6 @@ class HandPrediction:
     """unit, from the wrist to the middle knuckle"""
     landmarks: Float[np.ndarray, "21 3"]
     """metres"""
-    concentration: Float[np.ndarray, "2"]
-    """kappa of the von Mises-Fisher distributions of normal and direction"""
     confidence: float
     """probability that the normal is within 30 degrees"""
 
@@ -70,14 +68,13 @@ class HandPredictor:
         given = {
             "depth": depth, "context": context, "distance": distance, "color": color, "sigma": sigma, "image": picture
         }  # fmt: skip
-        normal, direction, kappa, landmarks, sure = (part.astype(np.float64) for part in self.network(**given))
+        normal, direction, landmarks, sure = (part.astype(np.float64) for part in self.network(**given))
         normal, direction = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in (normal, direction))
         return [
             HandPrediction(
                 view.directions_to_cam(normal[i]),
                 view.directions_to_cam(direction[i]),
                 view.to_cam(landmarks[i]),
-                np.exp(kappa[i]),
                 float(expit(sure[i])),
             )
             for i, view in enumerate(views)

@@ -147,7 +147,7 @@ class Samples:
             rotations, activity = drawn.rotations, drawn.activity
             sits = activity == NAMES.index("sitting")
         else:
-            rotations = self.poses[draw.integers(len(self.poses), b)]
+            rotations = self.poses.to(self.device)[draw.integers(len(self.poses), b)]
             activity = torch.zeros(b, dtype=torch.long, device=self.device)
             sits = activity > 0
         worn = dress(self.bank, ids, draw.generator)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shlex
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -26,6 +26,43 @@ from understudy.voxelposenet.validation import collect, summary
 CARD: Final = "MODEL_CARD.md"
 _NAME: Final = "voxelposenet"
 _BATCH = 16
+
+
+@dataclass(frozen=True)
+class _Words:
+    """What the card of one kind of network says."""
+
+    what: str
+    where: str
+    scored: str
+    limits: str
+
+
+_DEFAULT = _Words(
+    """\
+Estimates the 18 COCO joints of one person, hidden ones too, from the depth around the person and 2D keypoints; for
+every joint a mean, a spread, the radius that holds 68 % of errors, and the probability of being within 10 cm.""",
+    "`understudy.voxels.PersonView` and `understudy.voxelposenet.net`",
+    """\
+Of the network alone (no assembly), on simulated people in scenes that neither training nor calibration saw, with the
+sensors above; training saw other bodies, calibration other people with these bodies.""",
+    """\
+Where no depth
+is near the person, the distance comes from the apparent size and, if it is seen, the floor, and is off by 6 to 13 %,
+sometimes by half. Wrists and ankles are the least sure; hidden ones are guesses, and their sigma says so.""",
+)
+_PAPER = _Words(
+    """\
+The network of Zimmermann et al. (ICRA 2018), trained on simulation: of one person, a score volume for each of the 18
+COCO joints from occupied voxels and 2D keypoints. It has no calibrated uncertainty.""",
+    "`understudy.voxelposenet.paper_grid` and `understudy.voxelposenet.paper_net`; "
+    "`understudy.voxelposenet.paper_lifter.PaperLifter` runs it",
+    """\
+The run's last validation, with the paper's assembly, on other bodies and scenes than those of training; people without
+a root, whom the paper drops, are left out.""",
+    """\
+Who has neither neck nor hip with depth is dropped, as in the paper.""",
+)
 
 
 def publish(run: Path, out: Path, samples: int = 1536, progress: bool = False) -> list[Path]:
@@ -93,13 +130,13 @@ def _card(
     bodies = {"anny": f"{data.anny} of anny", "capsules": f"{data.capsules} of capsules"}
     chosen = " and ".join(v for k, v in bodies.items() if data.bodies in (k, "both"))
     machine = f"{about.get('machine', 'unknown')}, {config.device}, {about.get('processes', 1)} process(es)"
+    words = _DEFAULT if config.network == "default" else _PAPER
     return f"""# {_NAME}: network `{config.network}`
 
-Estimates the 18 COCO joints of one person, hidden ones too, from the depth around the person and 2D keypoints; for
-every joint a mean, a spread, the radius that holds 68 % of errors, and the probability of being within 10 cm.
+{words.what}
 
 - Files: {files}; {parameters:,} parameters.
-- Input and output: `understudy.voxels.PersonView` and `understudy.voxelposenet.net`.
+- Input and output: {words.where}.
 - Licence: MIT, as the code. No recorded person is in the training data.
 
 ## Training
@@ -113,9 +150,8 @@ every joint a mean, a spread, the radius that holds 68 % of errors, and the prob
 
 ## Scores
 
-Of the network alone (no assembly), on simulated people, bodies and scenes that neither training nor calibration saw,
-with the sensors above. The scenes are hard: nearly half of the joints are hidden. Errors are means in cm over joints in
-view.
+{words.scored}
+The scenes are hard: nearly half of the joints are hidden. Errors are means in cm over joints in view.
 
 | number | value |
 |---|---|
@@ -124,9 +160,7 @@ view.
 ## Limits
 
 Trained on simulation only: adults of 15 to 80 years, 1 to 6 m from the camera, upright cameras between 0.4 and 2.4 m
-above the floor. Not for children, animals, wheelchairs, or cameras that look straight down. Where no depth
-is near the person, the distance comes from the apparent size and, if it is seen, the floor, and is off by 6 to 13 %,
-sometimes by half. Wrists and ankles are the least sure; hidden ones are guesses, and their sigma says so.
+above the floor. Not for children, animals, wheelchairs, or cameras that look straight down. {words.limits}
 
 ## Configuration
 
