@@ -59,7 +59,7 @@ COCO joints from occupied voxels and 2D keypoints. It has no calibrated uncertai
     "`understudy.voxelposenet.paper_lifter.PaperLifter` runs it",
     """\
 The run's last validation, with the paper's assembly, on other bodies and scenes than those of training; people without
-a root, whom the paper drops, are left out.""",
+a root, whom the paper drops, count with what the network makes of a box around where they are.""",
     """\
 Who has neither neck nor hip with depth is dropped, as in the paper.""",
 )
