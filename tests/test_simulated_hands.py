@@ -14,14 +14,16 @@ from scipy.spatial.transform import Rotation  # noqa: E402
 
 from understudy.errors import ModelFileError, UnderstudyError  # noqa: E402
 from understudy.hands import pool as pools  # noqa: E402
-from understudy.hands.crop import CELL, EMPTY, GREY, PIXEL, PIXELS, HandView, crop_rotation  # noqa: E402
+from understudy.hands import training  # noqa: E402
+from understudy.hands.crop import CELL, CONTEXT, EMPTY, GREY, PIXEL, PIXELS, HandView, crop_rotation  # noqa: E402
 from understudy.hands.net import HandNormalNet, loss, von_mises_fisher  # noqa: E402
 from understudy.hands.pool import HandPool, PoolConfig  # noqa: E402
-from understudy.hands.training import HandTrainConfig, HandTrainer, _cut, inputs, relit, varied  # noqa: E402
-from understudy.skeleton import HAND_KEYPOINTS  # noqa: E402
+from understudy.hands.training import HandTrainConfig, HandTrainer, _cut, _some_unknown, inputs, relit, varied  # noqa: E402
+from understudy.skeleton import HAND_KEYPOINTS, JOINT  # noqa: E402
 from understudy.synthetic.bodies import load_bank  # noqa: E402
 from understudy.synthetic.draw import Draw  # noqa: E402
 from understudy.synthetic.hand_bank import FOREARM, articulate, load_hands, palm_normals, shortest_turn  # noqa: E402
+from understudy.synthetic.hand_boxes import carried_between  # noqa: E402
 from understudy.synthetic.hand_clothes import LOWER, SKIN, UPPER, ClothesConfig, dress_hands  # noqa: E402
 from understudy.synthetic.hand_color import color_words  # noqa: E402
 from understudy.synthetic.hand_crops import crop_rotation as torch_crop_rotation  # noqa: E402
@@ -30,6 +32,7 @@ from understudy.synthetic.hand_grips import BAR, FREE, Board, GripConfig, draw_b
 from understudy.synthetic.hand_images import HandScene, hand_image  # noqa: E402
 from understudy.synthetic.hand_samples import HandBatch, HandConfig, HandSamples, turned  # noqa: E402
 from understudy.synthetic.render import FAR, pixel_rays, splat, splat_which  # noqa: E402
+from understudy.synthetic.segments import SEGMENT, SEGMENTS  # noqa: E402
 
 STRAIGHT = torch.tensor([[-1.0, 0.0, 0.0]])
 
@@ -153,6 +156,30 @@ def test_board_is_where_rays_meet_it():
     assert (spot[hit][:, :2].abs() <= half[hit] + 1e-4).all()
     absent = Board(board.center, board.axes, board.half, ~board.there)
     assert (absent.cast(rays) == FAR).all()
+
+
+def test_what_both_hands_carry_lies_against_their_palms():
+    """Palms that face each other have it between them, palms that look upwards have it on them; others have nothing."""
+
+    def turned_about(axis: str, degrees: float) -> torch.Tensor:
+        return torch.tensor(Rotation.from_euler(axis, degrees, degrees=True).as_matrix()).float()
+
+    rotations = torch.eye(3).expand(3, len(SEGMENTS), 3, 3).clone()  # palms down
+    for side, inwards in (("right", -90), ("left", 90)):
+        rotations[0, SEGMENT[f"{side}_hand"]] = turned_about("y", inwards)
+        rotations[1, SEGMENT[f"{side}_hand"]] = turned_about("x", 180)
+    joints = torch.zeros(3, 18, 3)
+    joints[:, JOINT["right_wrist"]] = torch.tensor([-0.2, -0.4, 1.0])
+    joints[:, JOINT["left_wrist"]] = torch.tensor([0.2, -0.4, 1.0])
+    joints[:, [JOINT["right_hip"], JOINT["left_hip"]]] = torch.tensor([0.0, 0.0, 0.9])
+    carried = carried_between(Draw(4), 1.0, joints, rotations)
+    assert carried.there.tolist() == [True, True, False]
+    center, half = carried.boxes.center[:, 0], carried.boxes.half[:, 0]
+    assert half[0, 0] == pytest.approx(0.2 - 0.03, abs=1e-5) and center[0, 0] == pytest.approx(0, abs=1e-5)
+    assert center[1, 2] - half[1, 2] == pytest.approx(1.03, abs=1e-5)  # its bottom, over the palms' skin
+    assert ((center[:2, 1] + 0.4).abs() < half[:2, 1]).all()  # the palms are within its depth
+    assert center[2, 2] < -50  # sunk
+    assert not carried_between(Draw(4), 0.0, joints, rotations).there.any()
 
 
 def test_batches_are_functions_of_their_number(samples, batch):
@@ -335,7 +362,19 @@ def test_relit_images_stay_images():
     assert float((colors[:, 0] - colors[:, 1]).median()) > 30
 
 
-def test_variation_moves_everything_together(batch):
+def test_unknown_joints_are_where_they_are_put_in_use():
+    """As `HandView.of` does it: in the middle of the known ones; wrist and elbow are always known."""
+    context = torch.randn(4000, len(CONTEXT), 3, generator=torch.Generator().manual_seed(0))
+    out = _some_unknown(Draw(1), context)
+    changed = (out != context).any(-1)
+    assert not changed[:, :2].any() and 0.07 < float(changed.any(1).float().mean()) < 0.13
+    for row in changed.any(1).nonzero()[:20, 0].tolist():
+        middle = context[row][~changed[row]].mean(0)
+        torch.testing.assert_close(out[row][changed[row]], middle.expand(int(changed[row].sum()), 3), atol=1e-5, rtol=0)
+
+
+def test_variation_moves_everything_together(batch, monkeypatch):
+    monkeypatch.setattr(training, "_UNKNOWN", 0.0)
     out = varied(Draw(8), batch)
     shift = (out.landmarks - batch.landmarks)[:, 0]
     torch.testing.assert_close(out.landmarks - batch.landmarks, shift[:, None].expand(-1, 21, 3))

@@ -36,7 +36,7 @@ class SimulatedHands:
 
     hands: TrueHands
     depth: Float32[np.ndarray, "n 2 48 48"]
-    context: Float32[np.ndarray, "n 7 3"]
+    context: Float32[np.ndarray, "n 11 3"]
     distance: Float32[np.ndarray, "n 1"]
     sigma: Float32[np.ndarray, "n 2"]
     image: UInt8[np.ndarray, "n 3 72 72"]

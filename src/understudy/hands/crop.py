@@ -39,8 +39,11 @@ BEYOND: Final = 0.07
 """metres from the wrist along the forearm to the crop's centre"""
 SHORT: Final = 0.15
 """sine of the angle to the view below which a forearm has no direction in the image"""
-CONTEXT: Final = ("wrist", "elbow", "shoulder", "other_shoulder", "neck", "hips", "nose")
-"""Joints whose places the network is given; the hand's own side first"""
+CONTEXT: Final = (
+    "wrist", "elbow", "shoulder", "other_shoulder", "neck", "hips", "nose", "other_elbow", "other_wrist", "knee",
+    "other_knee",
+)  # fmt: skip
+"""Joints whose places the network is given; those without 'other' are of the hand's side, the hips between both"""
 
 _OTHER = {"left": "right", "right": "left"}
 SIGMA: Final = 0.06
@@ -61,7 +64,7 @@ class HandView:
     """colour camera's frame -> view; of a left hand the mirror is part of it (determinant -1)"""
     center: Float[np.ndarray, "3"]
     """metres, colour camera's frame"""
-    context: Float[np.ndarray, "7 3"]
+    context: Float[np.ndarray, "11 3"]
     """CONTEXT in view coordinates"""
     sigma: Float[np.ndarray, "2"]
     """metres, of UNSURE: radius of the ball that holds 68 % of the errors"""
@@ -156,12 +159,25 @@ def _between(n: int) -> Float[np.ndarray, "n k"]:
     return np.maximum(1 - np.abs(at[:, None] - np.arange(_KNOTS)), 0.0)
 
 
-def arm_context(joints: Float[np.ndarray, "18 3"], side: str) -> Float[np.ndarray, "7 3"]:
+@cache
+def context_rows(side: str) -> tuple[list[int], ...]:
+    """Rows of COCO-18 joints of one side's CONTEXT; it is the mean of two where there are two."""
+    out = []
+    for name in CONTEXT:
+        part = name.removeprefix("other_")
+        own = side if part == name else _OTHER[side]
+        if part in ("neck", "nose"):
+            out.append([JOINT[part]])
+        elif part == "hips":
+            out.append([JOINT["left_hip"], JOINT["right_hip"]])
+        else:
+            out.append([JOINT[f"{own}_{part}"]])
+    return tuple(out)
+
+
+def arm_context(joints: Float[np.ndarray, "18 3"], side: str) -> Float[np.ndarray, "11 3"]:
     """CONTEXT of one side from COCO-18 joints, in their frame."""
-    own = [f"{side}_{name}" for name in CONTEXT[:3]]
-    trunk = joints[rows(*own, f"{_OTHER[side]}_shoulder", "neck")]
-    hips = joints[rows("left_hip", "right_hip")].mean(axis=0)
-    return np.vstack([trunk, hips, joints[JOINT["nose"]]])
+    return np.stack([joints[rows].mean(axis=0) for rows in context_rows(side)])
 
 
 def crop_rotation(center: Float[np.ndarray, "3"], up: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:

@@ -15,9 +15,8 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from understudy.hands.crop import CELL, GREY, SIGMA, UNSURE
+from understudy.hands.crop import CELL, CONTEXT, GREY, SIGMA, UNSURE
 
-CONTEXT_SIZE: Final = 7
 N_LANDMARKS: Final = 21
 COLOR_SIZE: Final = 9
 """Numbers of the colour path: normal, direction, log of the spread, quality, and 1; all zero where it says nothing."""
@@ -63,7 +62,7 @@ class HandNormalNet(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        known = 3 * CONTEXT_SIZE + 1 + COLOR_SIZE + len(UNSURE)
+        known = 3 * len(CONTEXT) + 1 + COLOR_SIZE + len(UNSURE)
         self.told = nn.Sequential(nn.Linear(known, 128), nn.ReLU(), nn.Linear(128, 128), nn.ReLU())
         self.first = _conv(2, 32, 5, 2)
         self.image = nn.Sequential(nn.Conv2d(3, 32, 5, stride=3, padding=1, bias=False), nn.BatchNorm2d(32), nn.ReLU())
@@ -86,7 +85,7 @@ class HandNormalNet(nn.Module):
     def forward(
         self,
         depth: Float[Tensor, "b 2 48 48"],
-        context: Float[Tensor, "b 7 3"],
+        context: Float[Tensor, "b 11 3"],
         distance: Float[Tensor, "b 1"],
         color: Float[Tensor, "b 9"],
         sigma: Float[Tensor, "b 2"],

@@ -25,7 +25,7 @@ from understudy.synthetic.hand_samples import HandBatch, HandConfig, HandSamples
 
 SHARD: Final = 512
 """hands"""
-VERSION: Final = 6
+VERSION: Final = 7
 """Of what the simulation makes of the same settings."""
 _BATCH = 64
 

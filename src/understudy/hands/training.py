@@ -28,7 +28,7 @@ from torch import Tensor
 
 from understudy.errors import ModelFileError, UnderstudyError, one_of
 from understudy.files import read_json, write_atomically
-from understudy.hands.crop import CELL, CELLS, EMPTY, GREY, LIMIT
+from understudy.hands.crop import CELL, CELLS, EMPTY, GREY, LIMIT, UNSURE
 from understudy.hands.net import HandNormalNet, HandOutput, loss
 from understudy.hands.pool import SHARD, HandPool, PoolConfig
 from understudy.synthetic.draw import Draw
@@ -54,6 +54,7 @@ _DEPTH_SHIFT = 0.02  # metres, one sigma
 _COLOR_PIXELS = 1.5  # pixels of the colour image for one of the depth image
 _BLIND = 0.10  # share of hands without any depth
 _CUT, _CUT_FROM = 0.12, 0.1  # share of hands whose depth ends at a line, and how far from the middle at most (metres)
+_UNKNOWN, _UNKNOWN_JOINTS = 0.1, 0.5  # share of hands of whose bodies joints are not known, and of these joints
 _VALIDATION_BATCH = 512
 
 
@@ -291,13 +292,22 @@ def varied(draw: Draw, batch: HandBatch) -> HandBatch:
     seen = (near < EMPTY) & ~gone & (near + dz[:, None, None] > -LIMIT)
     near = torch.where(seen, (near + dz[:, None, None]).clamp_max(LIMIT), EMPTY)
     shift = torch.stack([du * CELL, dv * CELL, dz], -1)[:, None]
-    context = batch.context + shift + 0.006 * draw.normal(*batch.context.shape)
+    context = _some_unknown(draw, batch.context + shift + 0.006 * draw.normal(*batch.context.shape))
     return batch._replace(
         depth=torch.stack([near, seen.float()], 1), context=context, distance=batch.distance - dz[:, None],
         sigma=batch.sigma * draw.lognormal(0.15, *batch.sigma.shape),
         image=relit(draw, _rolled(batch.image, _PIXELS_IN_TWO_CELLS * du // 2, _PIXELS_IN_TWO_CELLS * dv // 2, GREY)),
         landmarks=batch.landmarks + shift,
     )  # fmt: skip
+
+
+def _some_unknown(draw: Draw, context: Float[Tensor, "b 11 3"]) -> Float[Tensor, "b 11 3"]:
+    """Of some bodies, joints but wrist and elbow put into the middle of those that are known, as `HandView.of` does."""
+    b, n = context.shape[:2]
+    known = ~(draw.chance(_UNKNOWN_JOINTS, b, n) & draw.chance(_UNKNOWN, b)[:, None])
+    known[:, : len(UNSURE)] = True
+    middle = (context * known[..., None]).sum(1, keepdim=True) / known.sum(1)[:, None, None]
+    return torch.where(known[..., None], context, middle)
 
 
 def _cut(draw: Draw, b: int) -> Bool[Tensor, "b s s"]:

@@ -96,10 +96,14 @@ def finger_bend(rotations: Float[Tensor, "b s 3 3"], side: str) -> Float[Tensor,
     return torch.acos(((relative.diagonal(dim1=1, dim2=2).sum(1) - 1) / 2).clamp(-1, 1)) / 1.9
 
 
-def draw_grips(draw: Draw, config: GripConfig, bend: Float[Tensor, " b"]) -> Grips:
-    """bend: of free hands' fingers, see `finger_bend`."""
+def draw_grips(
+    draw: Draw, config: GripConfig, bend: Float[Tensor, " b"], busy: Bool[Tensor, " b"] | None = None
+) -> Grips:
+    """bend: of free hands' fingers, see `finger_bend`. busy: hands that hold nothing of their own; default: none."""
     b = len(bend)
     kind = torch.where(draw.chance(config.holds, b), torch.where(draw.chance(config.bar, b), BAR, FLAT), FREE)
+    if busy is not None:
+        kind = torch.where(busy, FREE, kind)
     radius = draw.uniform(0.006, 0.03, b)
     around = 1.15 - 12.0 * radius
     level = torch.where(kind == BAR, around, torch.where(kind == FLAT, draw.uniform(0.05, 0.6, b), bend))

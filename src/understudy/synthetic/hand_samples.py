@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
-from understudy.hands.crop import BEYOND, PIXEL, PIXELS, UNSURE
+from understudy.hands.crop import BEYOND, CONTEXT, PIXEL, PIXELS, UNSURE, context_rows
 from understudy.skeleton import JOINT
 from understudy.synthetic import render
 from understudy.synthetic.bodies import BodyBank, pose
@@ -22,11 +22,21 @@ from understudy.synthetic.clothing import dress
 from understudy.synthetic.draw import Draw
 from understudy.synthetic.furniture import place_boxes
 from understudy.synthetic.hand_bank import HandBank, about, articulate, palm_normals
+from understudy.synthetic.hand_boxes import Carried, carried_between
 from understudy.synthetic.hand_clothes import LOWER, SKIN, UPPER, ClothesConfig, HandClothes, dress_hands
 from understudy.synthetic.hand_crops import crop_rotation, depth_crop, sampled, visible_share
-from understudy.synthetic.hand_grips import FREE, Board, GripConfig, draw_board, draw_grips, finger_bend, held_points
+from understudy.synthetic.hand_grips import (
+    FLAT,
+    FREE,
+    Board,
+    GripConfig,
+    draw_board,
+    draw_grips,
+    finger_bend,
+    held_points,
+)
 from understudy.synthetic.hand_images import HandScene, hand_image
-from understudy.synthetic.poses import NAMES, sample_poses
+from understudy.synthetic.poses import ACTIVITIES, NAMES, sample_poses
 from understudy.synthetic.scene import Boxes, Cameras, SceneConfig, about_z, place_cameras
 from understudy.synthetic.segments import SEGMENT, SEGMENTS
 from understudy.synthetic.sensors import SENSORS, Rig
@@ -39,11 +49,6 @@ _WRIST = (0.6, 0.2)  # radians, one sigma: bent, sideways
 _MOST_BENT = 0.1  # cosine of the angle between hand and forearm
 _HAND_LENGTH = 0.19  # metres, for sizes in pixels
 _SIDES = ("right", "left")
-_ROWS = {
-    "right": [JOINT[n] for n in ("right_wrist", "right_elbow", "right_shoulder", "left_shoulder", "neck", "nose")],
-    "left": [JOINT[n] for n in ("left_wrist", "left_elbow", "left_shoulder", "right_shoulder", "neck", "nose")],
-}
-_HIPS = [JOINT["right_hip"], JOINT["left_hip"]]
 _PIXEL = {"kinect2": 1 / 365, "azure": 1 / 504, "realsense": 1 / 425, "other": 1 / 320}
 """tangent of one depth pixel's angle"""
 _COLOR_PIXEL = {"kinect2": 1 / 1060, "azure": 1 / 610, "realsense": 1 / 900, "other": 1 / 600}
@@ -59,7 +64,7 @@ class HandBatch(NamedTuple):
 
     depth: Float[Tensor, "b 2 48 48"]
     """nearest depth of each cell relative to the crop's distance (metres; EMPTY where none), and 1 where measured"""
-    context: Float[Tensor, "b 7 3"]
+    context: Float[Tensor, "b 11 3"]
     """CONTEXT, relative to the crop's centre, with the errors that estimates have"""
     distance: Float[Tensor, "b 1"]
     sigma: Float[Tensor, "b 2"]
@@ -94,10 +99,14 @@ class HandConfig:
     turned: float = 0.45
     """share of hands that are bent and twisted at the wrist by more than the posture says"""
     clothes: ClothesConfig = field(default_factory=ClothesConfig)
+    carrying: float = 0.1
+    """share of people who carry, in the posture at least"""
+    boxes: float = 0.45
+    """of those whose hands are held that way, share with a thing between or on both"""
     wrist_m: tuple[float, float] = (0.07, 0.6)
     """errors of the estimated wrist: median of the radius that holds 68 % of them, and the spread of its logarithm"""
     elbow_m: tuple[float, float] = (0.055, 0.45)
-    """the same of the elbow"""
+    """the same of the elbow; both also of the other arm"""
     joint_m: tuple[float, float] = (0.04, 0.35)
     """the same of the other joints"""
 
@@ -109,6 +118,7 @@ class _People:
     cameras: Cameras
     rig: Rig
     boxes: Boxes
+    carried: Carried
     joints: Float[Tensor, "b 18 3"]
     points: Float[Tensor, "b p 3"]
     """of the body's surface, world"""
@@ -139,8 +149,8 @@ class _Hands:
 class _Views:
     """Where the crops look; the same frame."""
 
-    context: Float[Tensor, "b 7 3"]
-    sigma: Float[Tensor, "b 7"]
+    context: Float[Tensor, "b 11 3"]
+    sigma: Float[Tensor, "b 11"]
     """metres: what is known of the errors"""
     R: Float[Tensor, "b 3 3"]
     """R_view_cam"""
@@ -187,7 +197,7 @@ class HandSamples:
 
     def _people(self, draw: Draw, b: int) -> _People:
         ids = draw.integers(len(self.bodies), b)
-        drawn = sample_poses(b, draw.generator)
+        drawn = sample_poses(b, draw.generator, mix=ACTIVITIES | {"carrying": self.config.carrying})
         worn = dress(self.bodies, ids, draw.generator)
         posed = pose(self.bodies, ids, drawn.rotations, worn.points, worn.normals, worn.bridge)
         yaw = torch.where(draw.chance(0.5, b), 0.9 * draw.normal(b), draw.uniform(-torch.pi, torch.pi, b))
@@ -200,14 +210,14 @@ class HandSamples:
         rig = Rig(draw, self.config.sensors, b)
         cameras = place_cameras(draw, self.config.scene, joints, rig.max_z - 0.6)
         boxes = place_boxes(draw, self.config.scene, cameras, joints, drawn.activity == NAMES.index("sitting"))
-        return _People(cameras, rig, boxes, joints, points, drawn.rotations, turn[:, None] @ drawn.rotations)
+        R_world_segment = turn[:, None] @ drawn.rotations
+        carried = carried_between(draw, self.config.boxes, joints, R_world_segment)
+        return _People(cameras, rig, boxes, carried, joints, points, drawn.rotations, R_world_segment)
 
     def _side(self, draw: Draw, people: _People, side: str) -> HandBatch:
         """One hand of everybody."""
         mirror = torch.tensor([1.0 if side == "right" else -1.0, 1.0, 1.0])  # a left hand is looked at in a mirror
-        rows = _ROWS[side]
-        hips = people.joints[:, _HIPS].mean(1, keepdim=True)
-        known = torch.cat([people.joints[:, rows[:5]], hips, people.joints[:, rows[5:]]], 1)
+        known = torch.stack([people.joints[:, rows].mean(1) for rows in context_rows(side)], 1)
         known = people.cameras.to_cam(known) * mirror
         hands = self._hands(draw, people, side, mirror, known)
         views = self._views(draw, people, mirror, known)
@@ -234,20 +244,21 @@ class HandSamples:
             grip=hands.grip,
         )
 
-    def _hands(self, draw: Draw, people: _People, side: str, mirror: Tensor, known: Float[Tensor, "b 7 3"]) -> _Hands:
+    def _hands(self, draw: Draw, people: _People, side: str, mirror: Tensor, known: Float[Tensor, "b 11 3"]) -> _Hands:
         """Hands in detail, with what they hold, at the wrists."""
         R = people.cameras.R_cam_world @ people.R_world_segment[:, SEGMENT[f"{side}_hand"]]
         # the bodies' hands point along -x (right) or x (left), palms down
         x, z = R[..., 0] * (-mirror[0] * mirror), -R[..., 2] * mirror
         wrist, elbow = known[:, 0], torch.nn.functional.normalize(known[:, 1] - known[:, 0], dim=1)
         axes = torch.stack([x, torch.linalg.cross(z, x), z], 1)  # hand frame -> camera, rows
-        axes = turned(draw, self.config.turned, axes, elbow)
+        busy = people.carried.there
+        axes = torch.where(busy[:, None, None], axes, turned(draw, self.config.turned, axes, elbow))
         x, _, z = axes.unbind(1)
-        grips = draw_grips(draw, self.config.grips, finger_bend(people.rotations, side))
+        grips = draw_grips(draw, self.config.grips, finger_bend(people.rotations, side), busy)
         ids = draw.integers(len(self.hands), len(wrist))
         hand = articulate(self.hands, ids, grips.flex, grips.spread, (axes @ elbow[..., None])[..., 0])
         to_hip = (people.joints[:, JOINT[f"{side}_wrist"]] - people.joints[:, JOINT[f"{side}_hip"]]).norm(dim=1)
-        along, empty = self.hands.points[ids, :, 0], grips.kind == FREE
+        along, empty = self.hands.points[ids, :, 0], (grips.kind == FREE) & ~busy
         sight = (axes @ torch.nn.functional.normalize(-wrist, dim=1)[..., None])[..., 0]
         clothes = dress_hands(draw, self.config.clothes, along, self.hands.of_hand, empty, to_hip, sight)
         skin = hand.points + hand.normals * clothes.thick[..., None]
@@ -263,11 +274,11 @@ class HandSamples:
             marks=hand.landmarks @ axes + wrist[:, None],
             normal=(palm_normals(hand.landmarks)[:, None] @ axes)[:, 0],
             direction=x,
-            board=replace(board, there=board.there & behind).replaced_by(clothes.patch).moved(axes, wrist),
-            grip=grips.kind,
+            board=replace(board, there=board.there & behind & ~busy).replaced_by(clothes.patch).moved(axes, wrist),
+            grip=torch.where(busy, FLAT, grips.kind),
         )
 
-    def _views(self, draw: Draw, people: _People, mirror: Tensor, known: Float[Tensor, "b 7 3"]) -> _Views:
+    def _views(self, draw: Draw, people: _People, mirror: Tensor, known: Float[Tensor, "b 11 3"]) -> _Views:
         """What is believed of the body, and where it makes one look."""
         context, sigma = self._believed(draw, known)
         forearm = torch.nn.functional.normalize(context[:, 0] - context[:, 1], dim=1)
@@ -286,6 +297,7 @@ class HandSamples:
         back = torch.minimum(z_fine, self._background(people, side, mirror, views))
         rays = render.pixel_rays(views.scale, _RASTER)
         exact = torch.minimum(back, hands.board.moved(views.R.mT, -views.offset[:, 0]).cast(rays))
+        exact = torch.minimum(exact, _cast(people.carried.boxes, people.cameras, views.eye, mirror, views.R, rays))
         n = hands.skin.shape[1]
         towards = ~away[..., 0] & hands.counts
         bare = towards & ~hands.clothes.pocketed
@@ -298,8 +310,11 @@ class HandSamples:
         """What the colour camera sees around the hand."""
         away = ((hands.normals * hands.skin).sum(-1) > 0)[..., None]
         rays = render.pixel_rays(views.distance / PIXEL, PIXELS)
-        to_world = ((rays.flatten(1, 2) @ views.R) * mirror) @ people.cameras.R_cam_world
-        z_boxes = render.cast(people.boxes, people.cameras.center, to_world)
+        nowhere = torch.zeros_like(views.eye)
+        z_boxes, z_carried = (
+            _cast(boxes, people.cameras, nowhere, mirror, views.R, rays)
+            for boxes in (people.boxes, people.carried.boxes)
+        )
         board = hands.board.moved(views.R.mT, torch.zeros_like(hands.normal))
         tangent = torch.tensor([_COLOR_PIXEL[n] for n in self.config.sensors])[people.rig.kind]
         scene = HandScene(
@@ -310,8 +325,8 @@ class HandSamples:
             held=views.seen(hands.held),
             body=views.seen(self._rest(people, side, mirror)),
             body_wear=self._wear,
-            z_boxes=z_boxes.reshape(-1, PIXELS, PIXELS),
-            z_board=board.cast(rays),
+            z_boxes=z_boxes,
+            z_board=torch.minimum(board.cast(rays), z_carried),
             board_wear=torch.where(hands.clothes.patch.there, hands.clothes.patch_wear, -1),
             distance=views.distance,
             pixel=tangent * draw.lognormal(0.15, len(tangent)) * views.distance,
@@ -328,11 +343,8 @@ class HandSamples:
         scale, size = views.scale / _COARSE, _RASTER // _COARSE
         rest = views.seen(self._rest(people, side, mirror)) - views.offset
         z_body, _ = render.splat(rest, torch.zeros(rest.shape[:2], dtype=torch.bool), scale, size)
-        rays = render.pixel_rays(scale, size).flatten(1, 2)
-        to_world = people.cameras.R_cam_world
-        origin = people.cameras.center + ((views.eye * mirror)[:, None] @ to_world)[:, 0]
-        z_boxes = render.cast(people.boxes, origin, ((rays @ views.R) * mirror) @ to_world)
-        back = torch.minimum(z_body, z_boxes.reshape(z_body.shape))
+        rays = render.pixel_rays(scale, size)
+        back = torch.minimum(z_body, _cast(people.boxes, people.cameras, views.eye, mirror, views.R, rays))
         return torch.nn.functional.interpolate(back[:, None], scale_factor=_COARSE, mode="nearest")[:, 0]
 
     def _measured(
@@ -347,20 +359,31 @@ class HandSamples:
         return depth_crop(cloud, ok, views.distance)
 
     def _believed(
-        self, draw: Draw, joints: Float[Tensor, "b 7 3"]
-    ) -> tuple[Float[Tensor, "b 7 3"], Float[Tensor, "b 7"]]:
+        self, draw: Draw, joints: Float[Tensor, "b 11 3"]
+    ) -> tuple[Float[Tensor, "b 11 3"], Float[Tensor, "b 11"]]:
         """Joints with the errors of estimates, and what is known of the errors (metres).
 
         The errors are larger along the view; the wrist's are partly the elbow's; all joints share one of depth.
         """
         b, n = joints.shape[:2]
-        kinds = torch.tensor([self.config.wrist_m, self.config.elbow_m, *[self.config.joint_m] * (n - 2)])
+        of = {"wrist": self.config.wrist_m, "elbow": self.config.elbow_m}
+        kinds = torch.tensor([of.get(name.removeprefix("other_"), self.config.joint_m) for name in CONTEXT])
         sigma = kinds[:, 0] * torch.exp(kinds[:, 1] * draw.normal(b, n).clamp(-2.5, 2.5))
         ray = torch.nn.functional.normalize(joints, dim=2)
         noise = (draw.normal(b, n, 3) * 0.8 + ray * draw.normal(b, n, 1) * 0.9) * _PER_SIGMA
         noise[:, 0] = _SHARED * noise[:, 1] + (1 - _SHARED**2) ** 0.5 * noise[:, 0]
         noise = noise * draw.lognormal(0.25, b, n, 1) * sigma[..., None]
         return joints + noise + ray * 0.02 * draw.normal(b, 1, 1), sigma
+
+
+def _cast(
+    boxes: Boxes, cameras: Cameras, eye: Tensor, mirror: Tensor, R_view_cam: Tensor, rays: Float[Tensor, "b s s 3"]
+) -> Float[Tensor, "b s s"]:
+    """Distances along rays of the view from `eye` (camera's frame, mirrored as the view is) to the nearest box."""
+    to_world = cameras.R_cam_world
+    origin = cameras.center + ((eye * mirror)[:, None] @ to_world)[:, 0]
+    z = render.cast(boxes, origin, ((rays.flatten(1, 2) @ R_view_cam) * mirror) @ to_world)
+    return z.reshape(rays.shape[:3])
 
 
 def turned(
