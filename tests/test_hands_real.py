@@ -150,8 +150,9 @@ def test_open_palms_face_the_way_their_surface_does(upright):
 
 
 def test_open_palms_whose_fingers_point_to_all_sides():
+    """Of two, whose forearms point at the camera, the back is believed to be seen; not all who say so are unsure."""
     error = _errors(_frames("20210326-230536", ROUND))
-    assert np.median(error) < 20 and error.max() < 45
+    assert np.median(error) < 20 and np.sort(error)[-3] < 20
 
 
 def test_open_palms_are_steady(upright):

@@ -25,7 +25,7 @@ from understudy.types import OBSERVED, Frame, Hands, Palm, Person, RegisteredFra
 DepthCrop = Float32[np.ndarray, "2 48 48"]
 """see `HandView.depth_crop`"""
 
-LEAST_CONFIDENCE: Final = 0.21
+LEAST_CONFIDENCE: Final = 0.23
 """Palms below are left out."""
 
 CONFIDENT: Final = 0.95
