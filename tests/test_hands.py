@@ -496,11 +496,12 @@ def test_covered_hands_are_doubted(sure_hand, before: float | None) -> None:
 
 
 def test_real_frame(freiburg: object, models: None) -> None:
-    """The man in front holds a sheet of paper, seen well."""
+    """The man in front holds a sheet of paper in his right hand, seen well: its palm faces the image's right."""
     recording = recordings.open(freiburg)
     people = Estimator().estimate(recording[0])
     near = min(people, key=lambda p: p.keypoints[JOINT["neck"], 2])
-    assert any(palm is not None for palm in near.hands.values())
+    sheet = near.hands["right"]
+    assert sheet is not None and sheet.confidence > 0.9 and sheet.normal[0] > 0.8
     for p in people:
         for palm in p.hands.values():
             assert palm is None or np.linalg.norm(palm.normal) == pytest.approx(1)
