@@ -172,8 +172,8 @@ def test_what_should_not_happen_costs_one_recording(simulated, tmp_path, monkeyp
 def test_networks_are_loaded_once(simulated, tmp_path, monkeypatch):
     paths = [short(tmp_path / name, simulated) for name in ("drawer_1", "drawer_2")]
     loaded: list[Path] = []
-    load = runtime.load
-    monkeypatch.setattr(runtime, "load", lambda path, **options: loaded.append(path) or load(path, **options))
+    load = runtime.load_rows
+    monkeypatch.setattr(runtime, "load_rows", lambda path, **options: loaded.append(path) or load(path, **options))
     demonstrate(paths, tmp_path / "demos", TASK, detector="recording", hands="off", jobs=1)
     assert len(loaded) == 1
     people = [PeopleFile.read(tmp_path / "demos" / p.name / ESTIMATION / PEOPLE) for p in paths]

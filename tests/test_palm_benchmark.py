@@ -39,7 +39,7 @@ from understudy.benchmark.palms import (
 from understudy.camera import Camera, RGBDCamera
 from understudy.detectors.blazepose_nets import Region
 from understudy.errors import RecordingError, UnderstudyError
-from understudy.hands.crop import CELLS, EMPTY, GREY, PIXELS
+from understudy.hands.crop import CELLS, CONTEXT, EMPTY, GREY, PIXELS
 from understudy.hands.nets import INDEX, PINKY, HandLandmarks, HandNets, load_nets
 from understudy.recordings import FolderRecording, write_recording
 from understudy.recordings import open as open_recording
@@ -295,7 +295,7 @@ def simulated_hands(n: int = 6) -> SimulatedHands:
     color[color[:, 8] == 0] = 0
     depth = np.zeros((n, 2, CELLS, CELLS), np.float32)
     depth[:, 1] = 1
-    context, distance = np.zeros((n, 7, 3), np.float32), np.full((n, 1), 2, np.float32)
+    context, distance = np.zeros((n, len(CONTEXT), 3), np.float32), np.full((n, 1), 2, np.float32)
     image = rng.integers(0, 256, (n, 3, PIXELS, PIXELS)).astype(np.uint8)
     return SimulatedHands(hands(n), depth, context, distance, np.full((n, 2), 0.05, np.float32), image, color)
 
