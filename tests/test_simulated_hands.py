@@ -28,9 +28,9 @@ from understudy.synthetic.hand_clothes import LOWER, SKIN, UPPER, ClothesConfig,
 from understudy.synthetic.hand_color import color_words  # noqa: E402
 from understudy.synthetic.hand_crops import crop_rotation as torch_crop_rotation  # noqa: E402
 from understudy.synthetic.hand_crops import depth_crop  # noqa: E402
-from understudy.synthetic.hand_grips import BAR, FREE, Board, GripConfig, draw_board, draw_grips, held_points  # noqa: E402
+from understudy.synthetic.hand_grips import BAR, FREE, Board, GripConfig, draw_board, draw_grips, held_points, turned  # noqa: E402
 from understudy.synthetic.hand_images import HandScene, hand_image  # noqa: E402
-from understudy.synthetic.hand_samples import HandBatch, HandConfig, HandSamples, turned  # noqa: E402
+from understudy.synthetic.hand_samples import HandBatch, HandConfig, HandSamples  # noqa: E402
 from understudy.synthetic.render import FAR, pixel_rays, splat, splat_which  # noqa: E402
 from understudy.synthetic.segments import SEGMENT, SEGMENTS  # noqa: E402
 

@@ -1,5 +1,6 @@
-"""What simulated hands do: fingers bent as the posture says, around a bar, or against something flat; what they hold;
-and a board near them: the door behind a handle, the table under a palm. Hand frame (`hand_bank`), metres, radians.
+"""What simulated hands do: wrists turned, fingers bent as the posture says, around a bar, or against something flat;
+what they hold; and a board near them: the door behind a handle, the table under a palm. Hand frame (`hand_bank`),
+metres, radians.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from understudy.synthetic.draw import Draw
+from understudy.synthetic.hand_bank import about
 from understudy.synthetic.render import FAR
 from understudy.synthetic.segments import SEGMENT
 
@@ -21,6 +23,8 @@ BAR: Final = 1
 FLAT: Final = 2
 """Kinds of grips: nothing held, around a bar, against a flat thing"""
 
+_WRIST = (0.6, 0.2)  # radians, one sigma: bent, sideways
+_MOST_BENT = 0.1  # cosine of the angle between hand and forearm
 _JOINT = (0.75, 1.15, 0.6)  # share of the knuckle, the middle and the last joint in a finger's bend
 _BAR_Z = 0.022  # metres: a held bar's surface above the palm's plane
 _FLAT_Z = 0.03  # the same of a flat thing
@@ -94,6 +98,24 @@ def finger_bend(rotations: Float[Tensor, "b s 3 3"], side: str) -> Float[Tensor,
     hand, fingers = rotations[:, SEGMENT[f"{side}_hand"]], rotations[:, SEGMENT[f"{side}_fingers"]]
     relative = hand.mT @ fingers
     return torch.acos(((relative.diagonal(dim1=1, dim2=2).sum(1) - 1) / 2).clamp(-1, 1)) / 1.9
+
+
+def turned(
+    draw: Draw, share: float, axes: Float[Tensor, "b 3 3"], elbow: Float[Tensor, "b 3"]
+) -> Float[Tensor, "b 3 3"]:
+    """Hands with other wrists, as far as wrists go: bent towards palm or back, sideways, and twisted.
+
+    axes: rows, the hand frame's axes. elbow: unit vectors from the wrist, in the same frame as the axes.
+    """
+    b = len(axes)
+    flexed, sideways = (s * draw.normal(b) for s in _WRIST)
+    twisted = torch.where(draw.chance(0.5, b), draw.uniform(-1.3, 1.3, b), 0.0)
+    along, across, out = torch.eye(3).unbind(0)
+    other = about(across.expand(b, 3), flexed) @ about(out.expand(b, 3), sideways) @ about(along.expand(b, 3), twisted)
+    other = other @ axes
+    bent = -(other[:, 0] * elbow).sum(1)  # cosine
+    chosen = draw.chance(share, b) & (bent > _MOST_BENT)
+    return torch.where(chosen[:, None, None], other, axes)
 
 
 def draw_grips(

@@ -21,7 +21,7 @@ from understudy.synthetic.bodies import BodyBank, pose
 from understudy.synthetic.clothing import dress
 from understudy.synthetic.draw import Draw
 from understudy.synthetic.furniture import place_boxes
-from understudy.synthetic.hand_bank import HandBank, about, articulate, palm_normals
+from understudy.synthetic.hand_bank import HandBank, articulate, palm_normals
 from understudy.synthetic.hand_boxes import Carried, carried_between
 from understudy.synthetic.hand_clothes import LOWER, SKIN, UPPER, ClothesConfig, HandClothes, dress_hands
 from understudy.synthetic.hand_crops import crop_rotation, depth_crop, sampled, visible_share
@@ -34,6 +34,7 @@ from understudy.synthetic.hand_grips import (
     draw_grips,
     finger_bend,
     held_points,
+    turned,
 )
 from understudy.synthetic.hand_images import HandScene, hand_image
 from understudy.synthetic.poses import ACTIVITIES, NAMES, sample_poses
@@ -45,8 +46,6 @@ _RASTER = 80
 _FINE = 0.005  # metres of a raster's pixel at the hand
 _COARSE = 4  # the body's raster is so many times coarser
 _THINNED = 2  # of the body's points, every second
-_WRIST = (0.6, 0.2)  # radians, one sigma: bent, sideways
-_MOST_BENT = 0.1  # cosine of the angle between hand and forearm
 _HAND_LENGTH = 0.19  # metres, for sizes in pixels
 _SIDES = ("right", "left")
 _PIXEL = {"kinect2": 1 / 365, "azure": 1 / 504, "realsense": 1 / 425, "other": 1 / 320}
@@ -84,7 +83,7 @@ class HandBatch(NamedTuple):
     pixels: Float[Tensor, " b"]
     """size of the hand (0.19 m) in pixels of the depth camera"""
     grip: Int[Tensor, " b"]
-    """0 free, 1 grips a bar, 2 holds a flat thing"""
+    """0 free, 1 grips a bar, 2 holds a flat thing, or carries something with the other hand"""
 
 
 @dataclass(frozen=True)
@@ -384,21 +383,3 @@ def _cast(
     origin = cameras.center + ((eye * mirror)[:, None] @ to_world)[:, 0]
     z = render.cast(boxes, origin, ((rays.flatten(1, 2) @ R_view_cam) * mirror) @ to_world)
     return z.reshape(rays.shape[:3])
-
-
-def turned(
-    draw: Draw, share: float, axes: Float[Tensor, "b 3 3"], elbow: Float[Tensor, "b 3"]
-) -> Float[Tensor, "b 3 3"]:
-    """Hands with other wrists, as far as wrists go: bent towards palm or back, sideways, and twisted.
-
-    axes: rows, the hand frame's axes. elbow: unit vectors from the wrist, in the same frame as the axes.
-    """
-    b = len(axes)
-    flexed, sideways = (s * draw.normal(b) for s in _WRIST)
-    twisted = torch.where(draw.chance(0.5, b), draw.uniform(-1.3, 1.3, b), 0.0)
-    along, across, out = torch.eye(3).unbind(0)
-    other = about(across.expand(b, 3), flexed) @ about(out.expand(b, 3), sideways) @ about(along.expand(b, 3), twisted)
-    other = other @ axes
-    bent = -(other[:, 0] * elbow).sum(1)  # cosine
-    chosen = draw.chance(share, b) & (bent > _MOST_BENT)
-    return torch.where(chosen[:, None, None], other, axes)
