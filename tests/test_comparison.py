@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -214,6 +215,15 @@ def test_the_page_and_its_plots(group, tmp_path):
     for name in PLOTS:
         png = (tmp_path / f"kitchen-{name}.png").read_bytes()
         assert png.startswith(PNG) and len(png) > 10_000 and f"(kitchen-{name}.png)" in page
+
+
+def test_a_kept_out_sensor_stands_beside_a_training_as_long_with_it(group):
+    with_it, without = group.lifted[DETECTIONS, f"{RUN}anny"], group.lifted[DETECTIONS, held_out_name("kitchen")]
+    lifted = group.lifted | {(DETECTIONS, f"{RUN}both"): with_it}
+    table = list(comparison_report._trainings([replace(group, lifted=lifted)], Trainings(("both",), ("kitchen",))))[-1]
+    good, some = (17 * 0.95 + 18 * 0.4) / 35, (17 * 0.9 + 16 * 0.6) / 35
+    assert without is not with_it and "| as long, trained with it (- people) |" in table
+    assert f"| kitchen, Kitchen | - | {some:.3f} (4.9) | {good:.3f} (6.7) | {good:.3f} (6.7) |" in table
 
 
 def test_the_page_on_trainings_stays_until_there_are_others(group, tmp_path, monkeypatch):

@@ -10,12 +10,13 @@ from understudy import recordings, runtime
 from understudy.camera import Camera
 from understudy.errors import ModelFileError, UnderstudyError
 from understudy.estimator import Estimator
-from understudy.hands import HandNormalEstimator
+from understudy.hands import HandNormalEstimator, predictor
 from understudy.hands import estimator as hands_module
 from understudy.hands.color_path import ColorPalm
 from understudy.hands.crop import (
     CELL,
     CELLS,
+    CONTEXT,
     EMPTY,
     GREY,
     HALF,
@@ -326,6 +327,14 @@ def test_hands_do_not_depend_on_the_number_of_threads(n: int, monkeypatch: pytes
     for one, two in zip(*(ask([view] * n, depth, color, image) for ask in (single, several)), strict=True):
         for a, b in zip(astuple(one), astuple(two), strict=True):
             np.testing.assert_array_equal(a, b)
+
+
+def test_networks_of_other_versions_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(predictor, "CONTEXT", CONTEXT[:7])
+    with pytest.raises(
+        ModelFileError, match=r"handnormalnet\.onnx: .*'context' has the shape \(1, 11, 3\), not \(1, 7, 3\)"
+    ):
+        HandPredictor()
 
 
 def _word(normal: list[float], confidence: float) -> HandPrediction:

@@ -118,6 +118,8 @@ def open_rows(tmp_path_factory) -> Path:
 def test_rows_are_computed_each_on_its_own(open_rows, monkeypatch, limit, same_bits):
     monkeypatch.setenv(runtime.THREADS, limit)
     whole, by_row = load(open_rows), runtime.load_rows(open_rows, same_bits=same_bits)
+    assert [shape[0] for shape in whole.shapes.values()] == [-1, -1]
+    assert by_row.shapes == {"volume": (1, CHANNELS, SIZE, SIZE, SIZE), "scale": (1, 1, 1, 1, 1)}
     assert (by_row.inputs, by_row.outputs) == (whole.inputs, whole.outputs) == (("volume", "scale"), whole.outputs)
     x = np.concatenate([volume(seed) for seed in range(7)])
     scale = np.arange(1, 8, dtype=np.float32).reshape(7, 1, 1, 1, 1)

@@ -44,6 +44,8 @@ class Network:
         self._compiled = compiled
         self._idle: list[Any] = []  # requests that nobody uses
         self.inputs: Final[tuple[str, ...]] = _names(compiled.inputs)
+        self.shapes: Final = {name: _shape(port) for name, port in zip(self.inputs, compiled.inputs, strict=True)}
+        """of the inputs; -1 where a length is open"""
         self.outputs: Final[tuple[str, ...]] = tuple(outputs) or _names(compiled.outputs)
 
     @property
@@ -89,6 +91,7 @@ class RowNetwork:
         """
         self._network, self._at_a_time, self._alone = network, at_a_time, alone
         self.inputs: Final = network.inputs
+        self.shapes: Final = network.shapes
         self.outputs: Final = network.outputs
 
     def __call__(self, **named: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -205,3 +208,7 @@ def _openvino() -> tuple[Any, Any]:
 def _names(ports: Sequence[Any]) -> tuple[str, ...]:
     """One name of each; its number where it has none."""
     return tuple(min(port.names, default=str(i)) for i, port in enumerate(ports))
+
+
+def _shape(port: Any) -> tuple[int, ...]:
+    return tuple(-1 if length.is_dynamic else length.get_length() for length in port.partial_shape)

@@ -298,19 +298,17 @@ def _trainings(groups: Sequence[Group], trainings: Trainings) -> Iterator[str]:
         yield markdown_lines(["trained on", "people shown", *sets], rows)
     if trainings.without:
         yield "AUC (EPE cm) on recordings of a sensor that was kept out of training:"
+        columns = {"trained without it": held_out_name, f"{OURS} (shipped; trained with it)": lambda sensor: OURS}
+        if ALL in trainings.bodies:
+            columns[f"as long, trained with it ({shown(ALL)} people)"] = lambda sensor: RUN + ALL
         rows = [
             [
                 f"{sensor}, {g.title}",
                 shown(sensor),
-                cell(g, g.rows(sensor), held_out_name(sensor)),
-                cell(g, g.rows(sensor), OURS),
+                *(cell(g, g.rows(sensor), method(sensor)) for method in columns.values()),
             ]
             for sensor in trainings.without
             for g in groups
         ]
-        heads = ["sensor", "people shown", "trained without it", f"{OURS} (shipped; trained with it)"]
-        if ALL in trainings.bodies:
-            heads.append(f"as long, trained with it ({shown(ALL)} people)")
-            for row, (sensor, g) in zip(rows, ((s, g) for s in trainings.without for g in groups), strict=True):
-                row.append(cell(g, g.rows(sensor), RUN + ALL))
+        heads = ["sensor", "people shown", *columns]
         yield markdown_lines(heads, rows)

@@ -93,17 +93,16 @@ class BlazePoseDetector:
     ) -> list[Keypoints2D]:
         """People in an RGB image (see `Detector.detect`)."""
         height, width = color.shape[:2]
-        looks = tiled(width, height)
-        found = [self._pool.submit(self._found_in, look, color, None) for look in looks]
+        tiles = tiled(width, height)
+        found = [self._pool.submit(self._found_in, tile, color, None) for tile in tiles]
         scene = self._scene(color, depth)  # while the networks look at the tiles
-        special = windows(width, height, scene)
-        found += [self._pool.submit(self._found_in, look, color, scene) for look in special]
-        rows = [each.result() for each in found]
-        candidates = distinct(_candidates(scene, looks + special, rows))
-        looks_at = self._pool.map(lambda candidate: self._three_looks(color, scene, candidate), candidates)
+        others = windows(width, height, scene)
+        found += [self._pool.submit(self._found_in, window, color, scene) for window in others]
+        candidates = distinct(_candidates(scene, tiles + others, [rows.result() for rows in found]))
+        looks = self._pool.map(lambda candidate: self._three_looks(color, scene, candidate), candidates)
         people = [
             self._fuse(scene, candidate, [_coco(look, width, height) for look in three])
-            for candidate, three in zip(candidates, looks_at, strict=True)
+            for candidate, three in zip(candidates, looks, strict=True)
             if max(look.score for look in three) >= self.min_score
         ]
         return merge_duplicates([p for p in people if scene is None or p.life_size(scene)])

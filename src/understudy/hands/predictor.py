@@ -13,8 +13,9 @@ from jaxtyping import Float, Float32, UInt8
 from scipy.special import expit
 
 from understudy import runtime
+from understudy.errors import ModelFileError
 from understudy.hands.color_path import ColorPalm
-from understudy.hands.crop import GREY, PIXELS, HandView
+from understudy.hands.crop import CONTEXT, GREY, PIXELS, HandView
 
 WEIGHTS: Final = "handnormalnet.onnx"
 _OUTPUTS = ("normal", "direction", "landmarks", "sure")
@@ -45,7 +46,15 @@ class HandPredictor:
     """The exported network. Stateless; may be called from several threads."""
 
     def __init__(self, weights: Path | None = None):
-        self.network = runtime.load_rows(weights or weights_path(), outputs=_OUTPUTS, same_bits=True)
+        """weights: an exported network of one's own. Raises ModelFileError when it is not such a network."""
+        path = weights or weights_path()
+        self.network = runtime.load_rows(path, outputs=_OUTPUTS, same_bits=True)
+        told = self.network.shapes.get("context")
+        if told != (1, len(CONTEXT), 3):
+            raise ModelFileError(
+                f"{path}: a network of another version: its input 'context' has the shape {told}, not "
+                f"{(1, len(CONTEXT), 3)}; train it anew (understudy train --preset hands)"
+            )
 
     def __call__(
         self,

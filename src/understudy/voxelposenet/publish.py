@@ -47,9 +47,9 @@ every joint a mean, a spread, the radius that holds 68 % of errors, and the prob
 Of the network alone (no assembly), on simulated people in scenes that neither training nor calibration saw, with the
 sensors above; training saw other bodies, calibration other people with these bodies.""",
     """\
-Where no depth
-is near the person, the distance comes from the apparent size and, if it is seen, the floor, and is off by 6 to 13 %,
-sometimes by half. Wrists and ankles are the least sure; hidden ones are guesses, and their sigma says so.""",
+Where no
+depth is near the person, the distance comes from the apparent size and, if it is seen, the floor, and is off by 6 to
+13 %, sometimes by half. Wrists and ankles are the least sure; hidden ones are guesses, and their sigma says so.""",
 )
 _PAPER = _Words(
     """\
